@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import glob
 import json
+import math
 import os
 import shutil
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal
@@ -157,6 +158,11 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
     """
     with atomic_write(path) as (temporary,):
         temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def nan_to_none(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The values with None for NaN, which JSON has no word for."""
+    return {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in values.items()}
 
 
 def read_picture(path: Path, channels: Literal[1, 3]) -> UInt8[np.ndarray, "h w *channels"] | None:

@@ -16,7 +16,7 @@ from hsi_sc_nerf.analysis.change import Comparison
 from hsi_sc_nerf.analysis.change_days import Day
 from hsi_sc_nerf.analysis.change_maps import SPECTRUM, SURFACE
 from hsi_sc_nerf.analysis.spectral_mesh import write_mesh
-from hsi_sc_nerf.files import atomic_write, write_json
+from hsi_sc_nerf.files import atomic_write, nan_to_none, write_json
 from hsi_sc_nerf.terminal import markdown_table, markdown_text
 
 COLUMNS = (
@@ -132,14 +132,14 @@ def _content(
         "first_day": comparisons[0].before,
         "repeat": None if repeat is None else _placed(repeat),
         "days": days,
-        "rows": [_plain(row) for row in rows],
+        "rows": [nan_to_none(row) for row in rows],
     }
 
 
 def _placed(day: Day) -> dict[str, Any]:
     assert day.attitude is not None
     attitude = asdict(day.attitude) | {"transform": day.attitude.transform.matrix().tolist()}
-    return {"name": day.name, "attitude": _plain(attitude)}
+    return {"name": day.name, "attitude": nan_to_none(attitude)}
 
 
 def _set_down(comparisons: Sequence[Comparison], repeat: Day | None) -> list[str]:
@@ -178,10 +178,6 @@ def _cell(value: Any, numbers: str = ".6g") -> str:
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return ""
     return format(value, numbers) if isinstance(value, float) else str(value)
-
-
-def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in values.items()}
 
 
 def write_change_ply(path: Path, first: Day, comparisons: Sequence[Comparison]) -> None:

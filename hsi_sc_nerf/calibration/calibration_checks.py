@@ -18,7 +18,7 @@ from hsi_sc_nerf.calibration.lamp_drift import NotMeasurable
 from hsi_sc_nerf.calibration.reflectance import PixelCounts
 from hsi_sc_nerf.calibration.session_calibration import SessionCalibration
 from hsi_sc_nerf.calibration.white_reference import TARP_BRIGHTNESS
-from hsi_sc_nerf.calibration.white_source import WhiteSource, exposure_ratio, white_exposure_ratio, white_source
+from hsi_sc_nerf.calibration.white_source import WhiteSource, checked_source, exposure_ratio, white_exposure_ratio
 from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.findings import Finding, Level
 from hsi_sc_nerf.morphology import largest_component
@@ -79,7 +79,7 @@ def check_white(session: Session, source: Literal["auto"] | WhiteSource = "auto"
     Example:
         >>> refuse_red(check_white(open_session(Path("captures"))))
     """
-    found = white_source(session, "auto" if source == "target" else source, None)
+    found = checked_source(session, source)
     if found == "product":
         return [Finding("white", "green", "The instrument's finished reflectance needs no white.")]
     fault, clipped, values = _check_tarp(session) if found == "tarp" else _check_own_whites(session)

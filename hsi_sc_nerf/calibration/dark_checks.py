@@ -13,8 +13,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.calibration.detector import SOME_LINES, fill_no_data, spread_rows
-from hsi_sc_nerf.calibration.white_source import WhiteSource, white_cubes, white_source
+from hsi_sc_nerf.calibration.detector import some_lines
+from hsi_sc_nerf.calibration.white_source import WhiteSource, checked_source, white_cubes
 from hsi_sc_nerf.capture.envi import Cube
 from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.findings import Finding, leave_out, names_in_short
@@ -59,7 +59,7 @@ def check_dark(session: Session, source: Literal["auto"] | WhiteSource = "auto")
     Example:
         >>> refuse_red([check_dark(open_session(Path("captures")))])
     """
-    found = white_source(session, "auto" if source == "target" else source, None)
+    found = checked_source(session, source)
     if found == "product":
         return Finding("dark", "green", "The instrument's finished reflectance needs no dark reference.")
     exposures = _exposures(session, found)
@@ -74,8 +74,9 @@ def check_dark(session: Session, source: Literal["auto"] | WhiteSource = "auto")
         frames = [frame.name for frame in session.frames if frame.name in without]
         advice = f" or leave out with {leave_out(frames)}" if 0 < len(frames) < len(session.frames) else ""
         return Finding("dark", "red", f"{sentence}{advice}.", {"without": without})
-    white = np.percentile(_some(white_cubes(session, found)[0]), 95.0, axis=(0, 1))
-    lit = {e.name: light_over_white(_some(e.dark).mean(axis=(0, 1)), white) for e in exposures if e.dark is not None}
+    white = np.percentile(some_lines(white_cubes(session, found)[0]), 95.0, axis=(0, 1))
+    darks = {e.name: some_lines(e.dark).mean(axis=(0, 1)) for e in exposures if e.dark is not None}
+    lit = {name: light_over_white(dark, white) for name, dark in darks.items()}
     values: dict[str, object] = {"light_over_white": {name: round(value, 5) for name, value in lit.items()}}
     shining = [name for name, value in lit.items() if value > LIT_AMBER]
     if shining:
@@ -125,14 +126,9 @@ def light_over_white(dark: Float[np.ndarray, "bands"], white: Float[np.ndarray, 
     return slope if slope > CERTAINTY * error else 0.0
 
 
-def _some(cube: Cube) -> Float[np.ndarray, "rows samples bands"]:
-    rows = spread_rows(cube.shape[0], SOME_LINES)
-    return fill_no_data(np.asarray(cube.memmap()[rows], np.float32), cube.ignore_value)
-
-
 def _without_any(session: Session, exposures: Sequence[_Exposure]) -> Finding:
     """No capture has a dark: right for counts whose offset is gone, which then reach zero."""
-    some = [_some(exposure.counts) for exposure in exposures]
+    some = [some_lines(exposure.counts) for exposure in exposures]
     lowest = min(float(np.percentile(counts, 0.1)) for counts in some)
     brightest = max(float(counts.max()) for counts in some)
     values = {"lowest": lowest, "brightest": brightest}

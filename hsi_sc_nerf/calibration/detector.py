@@ -198,6 +198,11 @@ def spread_rows(lines: int, most: int) -> Int[np.ndarray, "rows"]:
     return np.unique(np.linspace(0, lines - 1, min(most, lines) + 2).round().astype(int)[1:-1])
 
 
+def some_lines(cube: Cube) -> Num[np.ndarray, "rows samples bands"]:
+    """Counts of ``SOME_LINES`` lines of a cube (`spread_rows`), no data filled (`fill_no_data`)."""
+    return fill_no_data(np.asarray(cube.memmap()[spread_rows(cube.shape[0], SOME_LINES)]), cube.ignore_value)
+
+
 def light_of_some_lines(cube: Cube, dark: Cube | None) -> Float[np.ndarray, "rows samples bands"]:
     """Counts above dark of ``SOME_LINES`` lines of a cube (`spread_rows`); 0 for no data."""
     counts = np.asarray(cube.memmap()[spread_rows(cube.shape[0], SOME_LINES)])

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from scipy.ndimage import median_filter
 
 from hsi_sc_nerf.calibration.detector import light_of_some_lines, unlit_bands
-from hsi_sc_nerf.calibration.white_source import WhiteSource, white_cubes, white_source
+from hsi_sc_nerf.calibration.white_source import WhiteSource, checked_source, white_cubes
 from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.findings import Finding, judged
 
@@ -34,7 +34,7 @@ def check_lines(session: Session, source: Literal["auto"] | WhiteSource = "auto"
     Raises:
         InputError: the session does not have that source of white.
     """
-    found = white_source(session, "auto" if source == "target" else source, None)
+    found = checked_source(session, source)
     wavelengths_nm = session.wavelengths_nm
     steps_nm = np.abs(np.diff(wavelengths_nm))
     if found == "product" or len(wavelengths_nm) < FEWEST_BANDS or np.median(steps_nm) > LARGEST_STEP_NM:

@@ -26,6 +26,15 @@ SHORTEST_NM = 100.0
 _FORMAT = "two columns, wavelength_nm and reflectance"
 
 
+def checked_source(session: Session, source: Literal["auto"] | WhiteSource) -> WhiteSource:
+    """The source of white that checks look at. A target inside the frames is not checked: its place is a setting.
+
+    Raises:
+        InputError: the session does not have it.
+    """
+    return white_source(session, "auto" if source == "target" else source, None)
+
+
 def white_source(session: Session, source: Literal["auto"] | WhiteSource, roi: Roi | None) -> WhiteSource:
     """The given source of white, or the first of tarp, capture and product that the session has.
 

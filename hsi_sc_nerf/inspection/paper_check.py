@@ -37,12 +37,14 @@ def check_paper(session: Session, quicklooks: Sequence[Quicklook], detections: S
     if session.panel_reflectance_path is not None:
         of_panel = read_panel(session.panel_reflectance_path, session.wavelengths_nm)
         panel = float(of_panel[nearest_bands(session.wavelengths_nm, PICTURE_NM)].mean())
-    found = [
-        panel * exposure_ratio(session.white, frame) * paper_brightness(quicklook.picture.mean(axis=-1), corners)
-        for frame, quicklook, seen in zip(session.frames, quicklooks, detections, strict=True)
-        for corners in seen.values()
-        if np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).min() >= LEAST_SIDE_PX
-    ]
+    found = []
+    for frame, quicklook, seen in zip(session.frames, quicklooks, detections, strict=True):
+        picture = panel * exposure_ratio(session.white, frame) * quicklook.picture.mean(axis=-1)
+        found += [
+            paper_brightness(picture, corners)
+            for corners in seen.values()
+            if np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).min() >= LEAST_SIDE_PX
+        ]
     if not found:
         return []
     paper = float(np.median(found))

@@ -13,15 +13,12 @@ from jaxtyping import Float, Num, UInt8
 from scipy.stats import median_abs_deviation
 
 from hsi_sc_nerf.calibration.detector import (
-    SOME_LINES,
     dark_columns,
-    fill_no_data,
     light_of_some_lines,
     no_data,
     saturation_counts,
-    spread_rows,
+    some_lines,
 )
-from hsi_sc_nerf.capture.envi import Cube
 from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.poses.session_pictures import edge_slope
 from hsi_sc_nerf.spectra import nearest_bands, to_8_bit
@@ -78,10 +75,10 @@ def quicklook_of(capture: Capture, white: Float[np.ndarray, "bands"]) -> Quicklo
         white: counts of a white above dark, of the same integration time.
     """
     cube = capture.cube
-    counts, read = cube.memmap(), _some_lines(cube)
+    counts, read = cube.memmap(), some_lines(cube)
     light, noise = light_of_some_lines(cube, capture.dark), np.zeros(cube.shape[2])
     channels = nearest_bands(cube.wavelengths_nm, PICTURE_NM)
-    dark = None if capture.dark is None else _some_lines(capture.dark)
+    dark = None if capture.dark is None else some_lines(capture.dark)
     if dark is not None:
         noise = np.asarray(dark, np.float32).std(axis=0).mean(axis=0)
     level = dark_columns(dark, *cube.shape[1:]).mean(axis=0)
@@ -133,7 +130,7 @@ def reflectance_noise(session: Session) -> float:
 def saturation_level(session: Session, quicklooks: Sequence[Quicklook]) -> float | None:
     """Reading at which the frames saturate, by the brightest of them; None if nothing saturates."""
     brightest = sorted(range(len(quicklooks)), key=lambda index: -quicklooks[index].top_counts)[:3]
-    cubes = [_some_lines(session.frames[index].cube) for index in brightest]
+    cubes = [some_lines(session.frames[index].cube) for index in brightest]
     return saturation_counts(cubes, np.ones(cubes[0].shape[1:], bool))
 
 
@@ -142,10 +139,6 @@ def sharpness_per_px(picture: Float[np.ndarray, "lines samples"]) -> float:
     smooth = cv2.GaussianBlur(np.asarray(picture, np.float32), (0, 0), 0.7)
     low, high = np.percentile(smooth, [1.0, 99.0])
     return edge_slope(smooth) / float(high - low) if high > low else 0.0
-
-
-def _some_lines(cube: Cube) -> Num[np.ndarray, "some samples bands"]:
-    return fill_no_data(np.asarray(cube.memmap()[spread_rows(cube.shape[0], SOME_LINES)]), cube.ignore_value)
 
 
 def _mean_counts(

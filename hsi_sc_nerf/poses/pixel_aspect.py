@@ -48,18 +48,18 @@ def pixel_aspect(adjusted: Adjusted, observations: MarkerObservations) -> tuple[
         turntable = problem.minimise(turntable)
         return Adjusted(turntable, problem)
 
-    best, cost = 0.0, {0.0: solved(0.0).cost}
-    step = _STEP
+    best, found = 0.0, solved(0.0)
+    cost_of_squares = found.cost
     for _ in range(_ROUNDS):
-        low, middle, high = (cost.setdefault(x, solved(x).cost) for x in (best - step, best, best + step))
-        curvature = low - 2.0 * middle + high
+        low, high = solved(best - _STEP).cost, solved(best + _STEP).cost
+        curvature = low - 2.0 * found.cost + high
         # Far from the minimum the cost need not be a parabola.
-        towards = np.sign(low - high) * 2.0 * step
-        move = 0.5 * step * (low - high) / curvature if curvature > 0.0 else towards
-        best += float(np.clip(move, -4.0 * step, 4.0 * step))
-    final = solved(best)
-    gain = max(cost[0.0] - final.cost, 0.0) / final.variance
-    p_value = max(float(f_distribution.sf(gain, 1, final.degrees_of_freedom)), _SMALLEST_P)
+        towards = np.sign(low - high) * 2.0 * _STEP
+        move = 0.5 * _STEP * (low - high) / curvature if curvature > 0.0 else towards
+        best += float(np.clip(move, -4.0 * _STEP, 4.0 * _STEP))
+        found = solved(best)
+    gain = max(cost_of_squares - found.cost, 0.0) / found.variance
+    p_value = max(float(f_distribution.sf(gain, 1, found.degrees_of_freedom)), _SMALLEST_P)
     return float(np.exp(best)), float(-np.log10(p_value))
 
 

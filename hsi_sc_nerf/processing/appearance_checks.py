@@ -123,9 +123,7 @@ def _frames_slip(
         if fit < SLIP_FIT and abs(slip_deg) >= LEAST_SLIP_DEG:
             slipped[f"{names[first]} to {names[second]}"] = slip_deg
     directions = np.sign([*slipped.values()])
-    if len(slipped) > MOST_SLIPS * len(pairs) and abs(directions.mean()) > ONE_DIRECTION:
-        return []
-    if not slipped:
+    if not slipped or (len(slipped) > MOST_SLIPS * len(pairs) and abs(directions.mean()) > ONE_DIRECTION):
         return []
     told = ", ".join(f"{pair} (by about {abs(deg):.0f} degrees)" for pair, deg in list(slipped.items())[:3])
     sentence = (
@@ -141,7 +139,8 @@ def _scatter(
     """Usual scatter of the channels between neighbouring points of successive frames; None with too few points."""
     found = []
     for first, second in pairs:
-        change = _change(views, looks, first, second, float(SLIPS_DEG[len(SLIPS_DEG) // 2 + 1]))
+        tree = _tree_of(views, first)
+        change = _change(views, looks, tree, first, second, float(SLIPS_DEG[len(SLIPS_DEG) // 2 + 1]))
         if change is not None:
             found.append(median_abs_deviation(change, scale="normal"))
     return np.maximum(np.median(found, axis=0), LEAST_SCATTER) if found else None
@@ -160,9 +159,9 @@ def slip_between(
     Returns:
         Degrees, counter-clockwise from above; and the difference that is left, over that without a slip.
     """
-    differences = []
+    tree, differences = _tree_of(views, first), []
     for slip_deg in SLIPS_DEG:
-        change = _change(views, looks, first, second, float(slip_deg))
+        change = _change(views, looks, tree, first, second, float(slip_deg))
         differences.append(np.inf if change is None else float(np.minimum(change**2, LARGEST_SIGMAS**2).mean()))
     none, best = len(SLIPS_DEG) // 2, int(np.argmin(differences))
     if not np.isfinite(differences[none]):
@@ -170,14 +169,26 @@ def slip_between(
     return float(SLIPS_DEG[best]), differences[best] / max(differences[none], 1e-12)
 
 
+def _tree_of(views: PointViews, rows: np.ndarray) -> cKDTree:
+    return cKDTree(views.positions_m[views.point[rows]])
+
+
 def _change(
-    views: PointViews, looks: Float[np.ndarray, "n channels"], first: np.ndarray, second: np.ndarray, slip_deg: float
+    views: PointViews,
+    looks: Float[np.ndarray, "n channels"],
+    tree: cKDTree,
+    first: np.ndarray,
+    second: np.ndarray,
+    slip_deg: float,
 ) -> Float[np.ndarray, "k channels"] | None:
-    """Change of the object's points from frame to frame, their median left out; None with too few points."""
+    """Change of the object's points from frame to frame, their median left out; None with too few points.
+
+    ``tree`` holds the points of the first frame (`_tree_of`).
+    """
     # What is now at a point was before at the point that the slip brings there.
     before = rotations_about_z(np.deg2rad([-slip_deg]))[0]
     points = views.positions_m[views.point[second]] @ before.T
-    away, nearest = cKDTree(views.positions_m[views.point[first]]).query(points, distance_upper_bound=MATCHED_M)
+    away, nearest = tree.query(points, distance_upper_bound=MATCHED_M)
     near = np.isfinite(away)
     if near.sum() < FEWEST_POINTS:
         return None

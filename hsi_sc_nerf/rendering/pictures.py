@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from torch import Tensor
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_angle_map, spectral_metrics, squared_error_map
-from hsi_sc_nerf.files import atomic_write, write_json
+from hsi_sc_nerf.files import atomic_write, nan_to_none, write_json
 from hsi_sc_nerf.indices.catalogue import find_index
 from hsi_sc_nerf.indices.formula import index_values
 from hsi_sc_nerf.plotting import (
@@ -74,11 +73,8 @@ def write_report(path: Path, rows: Sequence[Mapping[str, Any]], legends: Mapping
         InputError: the files cannot be written.
     """
     columns = {key: column for key, column in _COLUMNS.items() if key in rows[0]}
-    # JSON has no word for the score of a frame that shows nothing of the object.
-    rows = [
-        {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in row.items()}
-        for row in rows
-    ]
+    # A frame that shows nothing of the object has no score.
+    rows = [nan_to_none(row) for row in rows]
     cells = [
         [row["view"], *("-" if row[key] is None else shown(row[key]) for key, (_, shown) in columns.items())]
         for row in rows

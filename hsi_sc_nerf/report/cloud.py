@@ -102,10 +102,13 @@ def _scalar(name: str, tells: str, values: Float[np.ndarray, "n"], drawn: Sequen
 
 
 def _measures(
-    cloud: SpectralCloud, indices: Sequence[str], calibrated: Sequence[_Calibrated]
+    spectra: Float[np.ndarray, "n bands"],
+    nm: Float[np.ndarray, "bands"],
+    of_what: str,
+    indices: Sequence[str],
+    calibrated: Sequence[_Calibrated],
 ) -> Iterator[tuple[str, str, Float[np.ndarray, "n"], tuple[float, float]]]:
     """Name, meaning, values and ends of the colours of what spectra tell, of the material's where they are known."""
-    nm, (spectra, of_what) = cloud.wavelengths_nm, _analysed(cloud)
     for index in find_indices(indices, nm):
         values = index_values(index, spectra, nm)
         drawn = index.drawn_range if index.has_range else usual_range(values)
@@ -163,11 +166,11 @@ def cloud_payload(
     centre, reach_m = (low + high) / 2.0, max(float((high - low).max()) / 2.0, 1e-9)
     areas_m2 = point_areas_m2(cloud.points)
     lengths = np.maximum(np.linalg.norm(cloud.normals, axis=1, keepdims=True), 1e-12)
-    nm, (analysed, _) = cloud.wavelengths_nm, _analysed(cloud)
+    nm, (analysed, of_what) = cloud.wavelengths_nm, _analysed(cloud)
     calibrated = [(one, one.predictions(one.resampled(analysed, nm), only_inside=True)) for one in calibrations]
     scalars = [
         _scalar(name, tells, values, drawn) | {"index": True}
-        for name, tells, values, drawn in _measures(cloud, indices, calibrated)
+        for name, tells, values, drawn in _measures(analysed, nm, of_what, indices, calibrated)
     ]
     of_material = set(band_property_names(cloud.wavelengths_nm, "material"))
     scalars += [
