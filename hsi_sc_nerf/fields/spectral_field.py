@@ -3,7 +3,8 @@
 The paper (section "Model Formulation") follows the variant C1, sigma_0 of HS-NeRF (Chen et al. 2024, "Hyperspectral
 Neural Radiance Fields", arXiv 2403.14839): one density for all wavelengths, and a radiance of n channels that depends
 on position and viewing direction. Radiance is calibrated reflectance, so each channel ends in a sigmoid; or the
-channels are coefficients of a spectral basis, linear so that they can be composited before they are decoded.
+channels are coefficients of a spectral basis, linear so that they can be composited before they are decoded. The
+latter depend on the normal in the camera's frame instead of the viewing direction (`CameraShading`).
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from nerfstudio.fields.density_fields import HashMLPDensityField
 from nerfstudio.fields.nerfacto_field import NerfactoField
 from torch import Tensor, nn
 
+from hsi_sc_nerf.fields.camera_shading import CameraShading
 from hsi_sc_nerf.fields.hash_grid import FusedHashEncoding, fuse_hash_encodings
 
 BRIGHTNESS_GAIN = 0.05
@@ -46,7 +48,8 @@ class SpectralField(NerfactoField):
         coefficient_start: coefficients of the mean spectrum in a basis (`SpectralSubspace.mean_coefficients`): the
             head has a linear channel for each and begins near these values. None: the direct head, whose channels
             end in a sigmoid.
-        view_dependent: whether spectra depend on the viewing direction.
+        view_dependent: whether the head sees the viewing direction.
+        shading: of the coefficients, by the normal in the camera's frame; None for none.
         hidden_dim_color: width of the radiance head.
         num_layers_color: layers of the radiance head.
         skip_unseen: give samples of nil weight no spectrum, unless on a GPU.
@@ -65,13 +68,14 @@ class SpectralField(NerfactoField):
         num_bands: int,
         coefficient_start: Float[Tensor, "rank"] | None = None,
         view_dependent: bool = True,
+        shading: CameraShading | None = None,
         hidden_dim_color: int = 64,
         num_layers_color: int = 3,
         skip_unseen: bool = False,
         **nerfacto,
     ) -> None:
         super().__init__(aabb, hidden_dim_color=hidden_dim_color, num_layers_color=num_layers_color, **nerfacto)
-        self.view_dependent = view_dependent
+        self.view_dependent, self.shading = view_dependent, shading
         self.skip_unseen = skip_unseen
         direction_channels = self.direction_encoding.get_out_dim() if view_dependent else 0
         self.mlp_head = MLP(
@@ -144,6 +148,12 @@ class SpectralField(NerfactoField):
             inputs.append(of_samples(self._appearance(ray_samples).expand(*samples, -1)))
         # tiny-cuda-nn's encodings are in half precision, the head's weights are not.
         spectra = self.mlp_head(torch.cat(inputs, dim=-1).to(ray_samples.frustums.directions))
+        if self.shading is not None:
+            assert self._sample_locations is not None
+            places = (self._sample_locations.detach(), ray_samples.frustums.origins[..., :1, :].detach())
+            positions, origins = (of_samples(place).reshape(-1, 3) for place in places)
+            shaded = self.shading(spectra.flatten(0, -2), positions, origins)
+            spectra = shaded.view_as(spectra)
         if seen is not None:
             nothing = spectra.new_zeros(math.prod(samples), spectra.shape[-1])
             spectra = nothing.index_copy(0, seen, spectra).view(*samples, -1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -29,10 +29,12 @@ from hsi_sc_nerf.evaluation.spectral_metrics import (
     spectral_angle_mapper,
     spectral_rmse,
 )
+from hsi_sc_nerf.fields.camera_shading import REFRESH_EVERY
 from hsi_sc_nerf.fields.hash_grid import grid_for_dataset
 from hsi_sc_nerf.fields.occupancy_grid import OccupancyGrid
 from hsi_sc_nerf.fields.spectral_field import SpectralField
 from hsi_sc_nerf.models.backgrounds import make_background
+from hsi_sc_nerf.models.build_field import build_field
 from hsi_sc_nerf.models.chosen_effects import chosen_effects, require_effects
 from hsi_sc_nerf.models.compositing import BasisDecoder, SpectralRenderer
 from hsi_sc_nerf.models.losses import angle_loss, angular_loss, hsi_loss, separate_distortion
@@ -43,7 +45,7 @@ from hsi_sc_nerf.models.proposals import build_proposals
 from hsi_sc_nerf.models.view_images import view_images
 from hsi_sc_nerf.numerics import safe_log10
 from hsi_sc_nerf.packed.dataset import PackedDataset
-from hsi_sc_nerf.processing.spectral_subspace import SpectralSubspace, training_subspace
+from hsi_sc_nerf.processing.spectral_subspace import training_subspace
 
 METRIC_STRIDE = 8
 """The metrics of a batch are those of every so many of its rays: they are drawn, and nothing learns from them."""
@@ -156,7 +158,6 @@ class SpectralModel(NerfactoModel):
             subspace = training_subspace(dataset, metadata["frames"], config.basis_size)
             self.decoder = BasisDecoder(torch.from_numpy(subspace.scaled_basis).float())
         contraction = None if config.disable_scene_contraction else SceneContraction(order=float("inf"))
-        self.field = self._build_field(dataset, contraction, subspace)
         self.proposal_networks, self.density_fns = nn.ModuleList(), []
         if config.num_proposal_iterations > 0:
             networks, self.proposal_sampler = build_proposals(config, self.scene_box.aabb, contraction)
@@ -165,6 +166,18 @@ class SpectralModel(NerfactoModel):
         else:
             grid = build_occupancy(dataset, metadata["frames"], self.scene_box.aabb, from_checkpoint)
             self.proposal_sampler = OccupancySampler(grid, config.num_nerf_samples_per_ray, config.predict_normals)
+        self.field = build_field(
+            config,
+            len(dataset.wavelengths_nm),
+            grid_for_dataset(dataset) if config.match_resolution else None,
+            self.scene_box.aabb,
+            self.num_train_data,
+            view_dependent="view_dependence" in self.effects,
+            contraction=contraction,
+            subspace=subspace,
+            occupancy=self.occupancy,
+            turntable=metadata["turntable"],
+        )
         self.camera_optimizer = config.camera_optimizer.setup(
             refine="pose_refinement" in self.effects,
             num_cameras=self.num_train_data,
@@ -190,40 +203,6 @@ class SpectralModel(NerfactoModel):
         self.normals_shader = NormalsShader()
         self.step = 0
 
-    def _build_field(
-        self, dataset: PackedDataset, contraction: SceneContraction | None, subspace: SpectralSubspace | None
-    ) -> SpectralField:
-        """The spectral field, with a grid for what the camera resolves."""
-        config = self.config
-        options: dict[str, Any] = {
-            "num_levels": config.num_levels,
-            "max_res": config.max_res,
-            "log2_hashmap_size": config.log2_hashmap_size,
-        }
-        if config.match_resolution:
-            grid = grid_for_dataset(dataset)
-            options = {"num_levels": grid.levels, "max_res": grid.finest, "log2_hashmap_size": grid.log2_table}
-        if subspace is not None:
-            options["coefficient_start"] = torch.from_numpy(subspace.mean_coefficients)
-        return SpectralField(
-            self.scene_box.aabb,
-            num_bands=len(dataset.wavelengths_nm),
-            view_dependent="view_dependence" in self.effects,
-            skip_unseen=config.num_proposal_iterations == 0,
-            spatial_distortion=contraction,
-            hidden_dim=config.hidden_dim,
-            base_res=config.base_res,
-            features_per_level=config.features_per_level,
-            hidden_dim_color=config.hidden_dim_color,
-            num_images=self.num_train_data,
-            use_pred_normals=config.predict_normals,
-            use_average_appearance_embedding=config.use_average_appearance_embedding,
-            appearance_embedding_dim=config.appearance_embed_dim if config.use_appearance_embedding else 0,
-            average_init_density=config.average_init_density,
-            implementation=config.implementation,
-            **options,
-        )
-
     @property
     def occupancy(self) -> OccupancyGrid | None:
         """The grid that places the samples; None where proposal networks do."""
@@ -235,13 +214,15 @@ class SpectralModel(NerfactoModel):
         return self.proposal_sampler if isinstance(self.proposal_sampler, ProposalNetworkSampler) else None
 
     def prepare_step(self, step: int) -> None:
-        """Bring the occupancy grid up to date before a step of training; before the first, the field begins solid."""
+        """Bring occupancy grid and normals up to date before a step of training; at first, the field begins solid."""
         if self.occupancy is None:
             return
         if step == 0 and next(self.field.parameters()).requires_grad:  # not if the first stage freezes the field
             self.field.start_solid(self.occupancy.random_points)
             self.occupancy.refresh_all(self.field.density_fn)
         self.occupancy.refresh(self.field.density_fn, step)
+        if self.field.shading is not None and step % REFRESH_EVERY == 0:
+            self.field.shading.refresh(self.occupancy.opacity)
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         """Nerfacto's groups, with one for the weights of the field's networks, and without those that are empty."""

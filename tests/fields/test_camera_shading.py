@@ -1,0 +1,137 @@
+"""Shading by the normal in the camera's frame: of a ball, of any camera, and learned from a known highlight."""
+
+import math
+
+import pytest
+import torch
+from torch.nn import functional
+
+from hsi_sc_nerf.fields.camera_shading import CameraShading, smoothed_grid
+
+SHAPE, CELL, RADIUS = (48, 48, 40), 0.05, 0.7
+LOWER = torch.tensor([-1.2, -1.2, -1.0])
+CHANNELS = 3
+
+
+def pose(azimuth_deg: float) -> torch.Tensor:
+    """Camera 3 units from the axis, 1 above the middle, which looks at it."""
+    a = math.radians(azimuth_deg)
+    eye = torch.tensor([3.0 * math.cos(a), 3.0 * math.sin(a), 1.0])
+    back = functional.normalize(eye, dim=0)
+    right = torch.tensor([-math.sin(a), math.cos(a), 0.0])
+    made = torch.eye(4)
+    made[:3] = torch.stack([right, torch.linalg.cross(back, right), back, eye], dim=-1)
+    return made
+
+
+def ball_opacity() -> torch.Tensor:
+    indices = torch.stack(torch.meshgrid(*(torch.arange(n) for n in SHAPE), indexing="ij"), dim=-1)
+    centres = LOWER + (indices + 0.5) * CELL
+    opacity = (centres.norm(dim=-1) < RADIUS).float()
+    return torch.where(centres.norm(dim=-1) < RADIUS + 4 * CELL, opacity, -1.0)
+
+
+def shading(device="cpu", camera=None) -> CameraShading:
+    torch.manual_seed(0)
+    made = CameraShading(SHAPE, LOWER, CELL, CHANNELS, pose(20.0) if camera is None else camera, torch.zeros(3))
+    made.to(device).refresh(ball_opacity().to(device))
+    return made
+
+
+def on_ball(count: int, seed: int = 0) -> torch.Tensor:
+    return RADIUS * functional.normalize(torch.randn(count, 3, generator=torch.Generator().manual_seed(seed)), dim=-1)
+
+
+def test_normals_of_a_ball_point_outwards():
+    points = on_ball(500)
+    cos = (shading().normals(points) * points / RADIUS).sum(dim=-1)
+    assert torch.rad2deg(torch.acos(cos.clamp(max=1.0))).max() < 4.0
+
+
+def test_a_grid_without_matter_has_no_normals_and_finite_shading():
+    made = shading()
+    made.refresh(torch.full(SHAPE, -1.0))
+    assert (made.normals(on_ball(5)) == 0.0).all()
+    # The second ray begins on the axis, where a camera has no azimuth.
+    origins = torch.tensor([[3.0, 0.0, 1.0], [0.0, 0.0, 5.0]])
+    assert made(torch.ones(2, CHANNELS), torch.full((2, 3), 9.0), origins).isfinite().all()
+
+
+def test_smoothing_keeps_the_sum_and_has_the_stated_deviation():
+    values = torch.zeros(31, 33, 35)
+    values[15, 16, 17] = 1.0
+    smoothed = smoothed_grid(values, 2.5)
+    assert smoothed.sum() == pytest.approx(1.0, abs=1e-5)
+    for axis, middle in enumerate((15, 16, 17)):
+        profile = smoothed.sum(dim=[other for other in range(3) if other != axis])
+        deviation = (profile * (torch.arange(len(profile)) - middle) ** 2).sum().sqrt()
+        assert deviation == pytest.approx(2.5, rel=0.03)
+
+
+@pytest.mark.parametrize("azimuth_deg", [20.0, 150.0, -75.0])
+def test_rotations_are_those_of_the_turned_camera(azimuth_deg):
+    camera = pose(azimuth_deg)
+    found = shading().camera_rotations(camera[None, :3, 3]).view(3, 3)
+    torch.testing.assert_close(found, camera[:3, :3], atol=1e-5, rtol=0.0)
+
+
+def test_training_begins_without_shading():
+    coefficients = torch.randn(40, CHANNELS)
+    origins = pose(50.0)[:3, 3].expand(40, 3)
+    torch.testing.assert_close(shading()(coefficients, on_ball(40), origins), coefficients)
+
+
+def test_a_gain_beyond_reason_stays_finite():
+    made = shading()
+    made.network.layers[-1].bias.data.fill_(1e4)
+    coefficients = torch.ones(4, CHANNELS, requires_grad=True)
+    shaded = made(coefficients, on_ball(4), torch.full((4, 3), 3.0))
+    shaded.sum().backward()
+    assert shaded.isfinite().all()
+    assert coefficients.grad.isfinite().all()
+
+
+def test_normals_return_with_the_weights():
+    kept, new = shading().state_dict(), shading()
+    new.refresh(torch.full(SHAPE, -1.0))
+    new.load_state_dict(kept)
+    torch.testing.assert_close(new.normals(on_ball(20)), shading().normals(on_ball(20)), atol=0.0, rtol=0.0)
+
+
+def test_a_new_highlight_is_foretold_from_others():
+    """Each point is seen from two sides in training; from others it shows a highlight that it never showed."""
+    made, points = shading(), on_ball(3000)
+    spectra = 0.5 + 0.3 * torch.sin(7.0 * points)
+    cameras = [pose(azimuth_deg) for azimuth_deg in range(0, 360, 12)]
+
+    def seen(camera: torch.Tensor) -> torch.Tensor:
+        normals = functional.normalize(points, dim=-1) @ camera[:3, :3]
+        half = functional.normalize(torch.tensor([-0.3, 0.4, 1.0]), dim=0)
+        return spectra * (0.6 + 0.4 * normals[:, :1]) + 0.5 * torch.exp(-60.0 * (1.0 - normals @ half))[:, None]
+
+    optimizer = torch.optim.Adam(made.parameters(), lr=1e-2)
+    for step in range(300):
+        camera = cameras[step % 15]
+        facing = (points @ camera[:3, 2] > 0.0).nonzero()[:, 0][step % 2 :: 2]
+        origins = camera[:3, 3].expand(len(facing), 3)
+        error = made(spectra[facing], points[facing], origins) - seen(camera)[facing]
+        optimizer.zero_grad()
+        error.square().mean().backward()
+        optimizer.step()
+    camera = cameras[22]
+    facing = points @ camera[:3, 2] > 0.1
+    shaded = made(spectra[facing], points[facing], camera[:3, 3].expand(int(facing.sum()), 3))
+    error = (shaded - seen(camera)[facing]).square().mean().sqrt()
+    without = (spectra[facing] - seen(camera)[facing]).square().mean().sqrt()
+    assert error < 0.2 * without
+
+
+@pytest.mark.gpu
+def test_shading_on_a_gpu_is_that_of_the_processor(device):
+    origins = pose(50.0)[:3, 3].expand(40, 3)
+    coefficients, points = torch.ones(40, CHANNELS), on_ball(40)
+    here, there = shading(), shading(device)
+    for made in (here, there):
+        made.network.layers[-1].weight.data.fill_(0.1)
+    found = there(coefficients.to(device), points.to(device), origins.to(device))
+    torch.testing.assert_close(found.cpu(), here(coefficients, points, origins), atol=1e-4, rtol=1e-4)
