@@ -1,0 +1,157 @@
+"""What shading by the normal in the camera's frame brings, beside a head that sees the viewing direction.
+
+    uv run python benchmarks/independent_session.py /tmp/quince --rays 200
+    uv run python benchmarks/camera_shading.py --output-dir /tmp/shading --path-traced /tmp/quince
+
+Simulated objects before a lamp, with and without gloss, are judged against the noise-free light on the sensor, and
+their clouds against the true surface. The path-traced fruit is judged against its held-out views as measured, whose
+noise is in both models' errors alike. The head that sees the viewing direction is that of commit 0455bcd: the command
+runs on a checkout of it as well (``PYTHONPATH`` of that checkout, ``--model "viewing direction"``).
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+from accuracy_and_time import surface_figures
+from paper_tables import PaperTable, mean_and_deviation
+from results_table import write_results
+
+import hsi_sc_nerf
+from hsi_sc_nerf.benchmark.configurations import own_configuration
+from hsi_sc_nerf.evaluation.spectral_metrics import spectral_metrics
+from hsi_sc_nerf.files import write_json
+from hsi_sc_nerf.morphology import dilate
+from hsi_sc_nerf.processing.process import process_session
+from hsi_sc_nerf.simulate.truth import load_truth
+
+NOISE = ("photon_noise", "read_noise")
+SCENES = {
+    "pear, lamp without gloss": ("pear", ("lamp",)),
+    "pear, lamp and gloss": ("pear", ("lamp", "gloss")),
+    "tomato, lamp and its own gloss": ("tomato", ("lamp",)),
+}
+PATH_TRACED = "path-traced quince, two lamps"
+RIM_PX = 2
+DIGITS = {
+    "sam": 4,
+    "rmse": 4,
+    "rim": 4,
+    "f_half_mm": 1,
+    "area_percent": 2,
+    "volume_percent": 2,
+    "spots_percent": 1,
+    "seconds": 0,
+}
+COLUMNS = (
+    *("session", "view dependence by", "SAM, rad", "RMSE", f"RMSE of the outermost {RIM_PX} px", "F at 0.5 mm, %"),
+    *("area, %", "volume, %", "spots, %", "processor seconds"),
+)
+
+
+@dataclass(frozen=True)
+class CameraShadingTable(PaperTable):
+    """Simulate, process and train each session, and write a row of the table for it."""
+
+    common: str = "--pipeline.datamanager.train-num-rays-per-batch 1024"
+    """Words that every run gets, as in `hsi-sc-nerf benchmark`."""
+    iterations: int | None = 700
+    """Steps of each run."""
+    threads: int | None = 2
+    """CPU threads."""
+    frames: int = 30
+    """Frames of a session."""
+    size: int = 96
+    """Width and height of the images, pixels."""
+    bands: int = 24
+    """Spectral bands."""
+    seeds: tuple[int, ...] = (1, 2, 3)
+    """Seeds of the networks and of the drawn pixels, a run each."""
+    path_traced: Path | None = None
+    """Session of independent_session.py; without it, that row is left out."""
+    model: str = "normal in the camera's frame"
+    """Name of the model in the table."""
+    only: str = ""
+    """Sessions whose names contain this."""
+
+    def main(self) -> None:
+        """Make the table."""
+        for name, (scene, effects) in SCENES.items():
+            if self.only in name:
+                session = self.output_dir / name.replace(",", "").replace(" ", "-")
+                self.measured(name, session, self.simulated(scene, session, (*NOISE, *effects)))
+        if self.path_traced is not None and self.only in PATH_TRACED:
+            data = process_session(self.path_traced, self.output_dir / "path-traced-data")
+            self.measured(PATH_TRACED, None, data)
+
+    def measured(self, name: str, session: Path | None, data: Path) -> None:
+        """Train with each seed, judge, and write the row."""
+        found = [self.judged(session, data, seed) for seed in self.seeds]
+        cells = [
+            mean_and_deviation([one[figure] for one in found], digits) if figure in found[0] else ""
+            for figure, digits in DIGITS.items()
+        ]
+        seeds, commit = " ".join(map(str, self.seeds)), commit_of_the_package()
+        rows = [[name, self.model, *cells]]
+        write_results("camera_shading", COLUMNS, rows, keys=2, seed=seeds, commit=commit, folder=self.results)
+
+    def judged(self, session: Path | None, data: Path, seed: int) -> dict[str, float]:
+        """Figures of one run; a run that was judged before is not judged again."""
+        folder = f"{self.model.replace(' ', '-').replace(chr(39), '')}-{seed}"
+        runs = data.with_name(f"{data.name}-{folder}")
+        configuration = own_configuration("shading=--pipeline.model.effects view_dependence")
+        (run,) = self.trained([configuration], data, runs, seed)
+        kept = runs / "judged.json"
+        if not kept.is_file():
+            config = runs / "shading" / "benchmark" / run.method / "run" / "config.yml"
+            figures = held_out_errors(config, session)
+            figures |= {} if session is None else surface_figures(config, session)
+            write_json(kept, figures | {"seconds": run.checkpoints[-1].cpu_seconds})
+        figures = json.loads(kept.read_text(encoding="utf-8"))
+        return figures
+
+
+def held_out_errors(config: Path, session: Path | None) -> dict[str, float]:
+    """SAM and RMSE on the object, and RMSE of its outermost pixels: means over views, against light without noise.
+
+    Args:
+        config: of the run.
+        session: simulated; None for views as measured.
+    """
+    from nerfstudio.utils.eval_utils import eval_setup
+
+    _, pipeline, _, _ = eval_setup(config, test_mode="test")
+    pipeline.eval()
+    manager = pipeline.datamanager
+    frames = manager.eval_dataset.metadata["frames"]
+    truth = None if session is None else load_truth(session)
+    found = []
+    for camera, batch in manager.fixed_indices_eval_dataloader:
+        with torch.no_grad():
+            rendered = pipeline.model.get_outputs_for_camera(camera)["spectral"].cpu()
+        expected = batch["spectral"]
+        if truth is not None:
+            expected = torch.from_numpy(truth.light(frames[batch["image_idx"]].capture).radiance()).to(rendered)
+        mask = batch["mask"][..., 0].bool()
+        rim = mask & torch.from_numpy(dilate(~mask.numpy(), 2 * RIM_PX + 1))
+        metrics = spectral_metrics(rendered, expected, mask)
+        outermost = (rendered - expected)[rim].square().mean().sqrt()
+        found.append({"sam": metrics["sam"], "rmse": metrics["rmse"], "rim": float(outermost)})
+    return {name: float(np.mean([view[name] for view in found])) for name in found[0]}
+
+
+def commit_of_the_package() -> str:
+    """Commit of the package that is measured, which may be another checkout than the benchmark's."""
+    folder = Path(hsi_sc_nerf.__file__).parent
+    found = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=folder, capture_output=True, text=True)
+    return found.stdout.strip() or "unknown"
+
+
+if __name__ == "__main__":
+    tyro.cli(CameraShadingTable).main()
