@@ -113,8 +113,8 @@ class CameraShadingTable(PaperTable):
             figures = held_out_errors(config, session)
             figures |= {} if session is None else surface_figures(config, session)
             write_json(kept, figures | {"seconds": run.checkpoints[-1].cpu_seconds})
-        figures = json.loads(kept.read_text(encoding="utf-8"))
-        return figures
+        scores: dict[str, float] = json.loads(kept.read_text(encoding="utf-8"))
+        return scores
 
 
 def held_out_errors(config: Path, session: Path | None) -> dict[str, float]:

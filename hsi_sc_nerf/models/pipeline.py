@@ -51,8 +51,8 @@ class SpectralPipeline(VanillaPipeline):
         different = own.keys() ^ loaded_state.keys()
         if different:
             raise SystemExit(
-                "hsi-sc-nerf: the checkpoint was made with other settings of the model "
-                f"({', '.join(sorted(different)[:3])}); take those of the config.yml beside it."
+                "hsi-sc-nerf: the checkpoint was made with other settings of the model or by another version "
+                f"({', '.join(sorted(different)[:3])}); take the settings of the config.yml beside it, or train anew."
             )
         if any(
             value.shape != loaded_state[name].shape

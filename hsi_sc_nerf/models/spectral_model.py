@@ -62,8 +62,8 @@ class SpectralModelConfig(NerfactoModelConfig):
     basis_size: int | None = None
     """Spectra in the basis of the head "basis". None: as many as stand out of the noise, at most 16."""
     effects: str = "auto"
-    """What is simulated, joined by commas: view_dependence (a point's spectrum depends on the viewing direction, by
-    gloss or by lamps before which the object turns), still_chamber (the background is a picture of the chamber, taken
+    """What is simulated, joined by commas: view_dependence (a point's spectrum depends on how it is turned to the
+    camera and the lamps, which stand still), still_chamber (the background is a picture of the chamber, taken
     from the frames, instead of its median spectrum), pose_refinement (training moves the poses). none: nothing of it.
     auto: what the dataset calls for (docs/validation/effects.md)."""
     background: Literal["chamber", "last-sample"] = "chamber"

@@ -95,9 +95,9 @@ def view_dependence(change: Change | None) -> Effect:
     percent, noise = 100.0 * change.rms, 100.0 * change.noise
     return _decided(
         *("view_dependence", percent, noise, LEAST_VIEW_CHANGE_PERCENT, "%"),
-        "Points change their brightness with the direction that they face in the chamber, so that the field sees the "
-        "viewing direction.",
-        "Points look the same from all sides, so that the field does without the viewing direction.",
+        "Points change their brightness with the direction that they face in the chamber, so that the model shades "
+        "them by it.",
+        "Points look the same from all sides, so that the model does not shade them.",
     )
 
 

@@ -76,8 +76,9 @@ def test_the_published_preset_keeps_what_it_has():
 def test_what_is_off_is_not_built(tiny_dataset, tmp_path):
     _, bare = made(tiny_dataset, tmp_path / "none", "none")
     _, full = made(tiny_dataset, tmp_path / "all", ",".join(MODEL_EFFECTS))
-    head, wider = (model.field.mlp_head.layers[0].in_features for model in (bare, full))
-    assert wider - head == full.field.direction_encoding.get_out_dim()
+    assert bare.field.shading is None
+    assert full.field.shading is not None
+    assert not full.field.view_dependent  # the normal stands in for the viewing direction
     assert bare.background.image is None
     assert full.background.image is not None
     assert [*bare.camera_optimizer.parameters()] == []

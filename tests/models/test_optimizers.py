@@ -60,7 +60,7 @@ def test_muon_moves_the_networks_weights_alone(tiny_dataset, tmp_path):
     made = trainer(tiny_dataset, tmp_path)
     groups = made.pipeline.get_param_groups()
     assert all(parameter.ndim == 2 for parameter in groups["field_networks"])
-    assert len(groups["field_networks"]) == 5
+    assert len(groups["field_networks"]) == 8
     grids = [p for name, p in made.pipeline.model.field.named_parameters() if name.endswith("hash_table")]
     assert {id(grid) for grid in grids} <= {id(parameter) for parameter in groups["fields"]}
     everything = [id(parameter) for group in groups.values() for parameter in group]
