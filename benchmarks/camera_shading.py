@@ -63,7 +63,7 @@ class CameraShadingTable(PaperTable):
     """Words that every run gets, as in `hsi-sc-nerf benchmark`."""
     iterations: int | None = 700
     """Steps of each run."""
-    threads: int | None = 2
+    threads: int | None = 1
     """CPU threads."""
     frames: int = 30
     """Frames of a session."""

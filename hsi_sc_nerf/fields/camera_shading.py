@@ -14,8 +14,6 @@ from nerfstudio.field_components.mlp import MLP
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hsi_sc_nerf.geometry.ray_projection import in_camera_frame
-
 REFRESH_EVERY = 50
 """Steps after which the normals follow the opacities of the occupancy grid."""
 SMOOTHING_CELLS = 2.5
@@ -105,9 +103,7 @@ class CameraShading(nn.Module):
             origins: of the rays that see the points, scene units: the camera from there.
         """
         with torch.no_grad():
-            rotations = self.camera_rotations(origins)
-            normals = in_camera_frame(self.normals(positions), rotations)[..., :2]
-            aside = in_camera_frame(positions - self._axis, rotations)[..., :2]
+            normals, aside = self.across_image(origins, self.normals(positions), positions - self._axis)
         at = (normals + self.parallax * aside)[None, None]
         looked_up = [
             functional.grid_sample(values, at, mode="bilinear", padding_mode="border", align_corners=True)[0, :, 0].T
@@ -125,17 +121,26 @@ class CameraShading(nn.Module):
         )[0, :, 0, 0].T
         return functional.normalize(gradient, dim=-1, eps=1e-12)
 
-    def camera_rotations(self, origins: Float[Tensor, "n 3"]) -> Float[Tensor, "n 9"]:
-        """Camera-to-world rotation, row by row, of the camera that stands where rays begin.
+    def across_image(
+        self, origins: Float[Tensor, "n 3"], *vectors: Float[Tensor, "n 3"]
+    ) -> list[Float[Tensor, "n 2"]]:
+        """Components of vectors to the right and upwards in the camera that stands where rays begin.
 
         It is the measured camera turned about the axis. A viewer's rays have no measured camera, and are lit as those
         of the measured one at the same azimuth.
         """
-        start, here = (self._camera[:3, 3] - self._axis)[:2], (origins - self._axis)[..., :2]
-        turned = torch.stack([here @ start, start[0] * here[..., 1] - start[1] * here[..., 0]], dim=-1)
-        cos, sin = functional.normalize(turned, dim=-1, eps=1e-12)[..., None].unbind(dim=-2)
-        x, y, z = self._camera[:3, :3].unbind(dim=0)
-        return torch.cat([cos * x - sin * y, sin * x + cos * y, z.expand(len(origins), 3)], dim=-1)
+        start, (x, y, _) = self._camera[:2, 3] - self._axis[:2], (origins - self._axis).unbind(dim=-1)
+        cos, sin = start[0] * x + start[1] * y, start[0] * y - start[1] * x
+        length = torch.hypot(cos, sin).clamp_min(1e-12)
+        cos, sin = cos / length, sin / length
+        right_and_up = self._camera[:3, :2]
+        found = []
+        for vector in vectors:
+            x, y, z = vector.unbind(dim=-1)
+            turned_back = torch.stack([cos * x + sin * y, cos * y - sin * x, z], dim=-1)
+            # Not a matrix product, which mixed precision would round.
+            found.append(torch.stack([(turned_back * axis).sum(dim=-1) for axis in right_and_up.unbind(-1)], dim=-1))
+        return found
 
     @torch.no_grad()
     def refresh(self, opacity: Float[Tensor, "x y z"]) -> None:

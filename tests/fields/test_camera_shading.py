@@ -61,7 +61,7 @@ def test_smoothing_keeps_the_sum_and_has_the_stated_deviation():
     values = torch.zeros(31, 33, 35)
     values[15, 16, 17] = 1.0
     smoothed = smoothed_grid(values, 2.5)
-    assert smoothed.sum() == pytest.approx(1.0, abs=1e-5)
+    assert smoothed.sum() == pytest.approx(1.0, abs=1e-4)
     for axis, middle in enumerate((15, 16, 17)):
         profile = smoothed.sum(dim=[other for other in range(3) if other != axis])
         deviation = (profile * (torch.arange(len(profile)) - middle) ** 2).sum().sqrt()
@@ -69,10 +69,10 @@ def test_smoothing_keeps_the_sum_and_has_the_stated_deviation():
 
 
 @pytest.mark.parametrize("azimuth_deg", [20.0, 150.0, -75.0])
-def test_rotations_are_those_of_the_turned_camera(azimuth_deg):
-    camera = pose(azimuth_deg)
-    found = shading().camera_rotations(camera[None, :3, 3]).view(3, 3)
-    torch.testing.assert_close(found, camera[:3, :3], atol=1e-5, rtol=0.0)
+def test_the_camera_turns_with_the_azimuth(azimuth_deg):
+    camera, vectors = pose(azimuth_deg), torch.randn(7, 3)
+    (found,) = shading().across_image(camera[:3, 3].expand(7, 3), vectors)
+    torch.testing.assert_close(found, vectors @ camera[:3, :2], atol=1e-5, rtol=0.0)
 
 
 def test_training_begins_without_shading():
@@ -100,7 +100,7 @@ def test_normals_return_with_the_weights():
 
 def test_a_new_highlight_is_foretold_from_others():
     """Each point is seen from two sides in training; from others it shows a highlight that it never showed."""
-    made, points = shading(), on_ball(3000)
+    made, points = shading(), on_ball(1500)
     spectra = 0.5 + 0.3 * torch.sin(7.0 * points)
     cameras = [pose(azimuth_deg) for azimuth_deg in range(0, 360, 12)]
 
@@ -110,7 +110,7 @@ def test_a_new_highlight_is_foretold_from_others():
         return spectra * (0.6 + 0.4 * normals[:, :1]) + 0.5 * torch.exp(-60.0 * (1.0 - normals @ half))[:, None]
 
     optimizer = torch.optim.Adam(made.parameters(), lr=1e-2)
-    for step in range(300):
+    for step in range(200):
         camera = cameras[step % 15]
         facing = (points @ camera[:3, 2] > 0.0).nonzero()[:, 0][step % 2 :: 2]
         origins = camera[:3, 3].expand(len(facing), 3)
