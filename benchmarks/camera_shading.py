@@ -1,7 +1,8 @@
 """What shading by the normal in the camera's frame brings, beside a head that sees the viewing direction.
 
     uv run python benchmarks/independent_session.py /tmp/quince --rays 200
-    uv run python benchmarks/camera_shading.py --output-dir /tmp/shading --path-traced /tmp/quince
+    uv run python benchmarks/camera_shading.py --output-dir /tmp/shading --path-traced /tmp/quince \\
+        --picture docs/images/highlights.png
 
 Simulated objects before a lamp, with and without gloss, are judged against the noise-free light on the sensor, and
 their clouds against the true surface. The path-traced fruit is judged against its held-out views as measured, whose
@@ -20,6 +21,7 @@ import numpy as np
 import torch
 import tyro
 from accuracy_and_time import surface_figures
+from matplotlib import rc_context
 from paper_tables import PaperTable, mean_and_deviation
 from results_table import write_results
 
@@ -28,6 +30,7 @@ from hsi_sc_nerf.benchmark.configurations import own_configuration
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_metrics
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.morphology import dilate
+from hsi_sc_nerf.plotting import STYLE, new_figure, save_figure, show_image
 from hsi_sc_nerf.processing.process import process_session
 from hsi_sc_nerf.simulate.truth import load_truth
 
@@ -39,6 +42,7 @@ SCENES = {
 }
 PATH_TRACED = "path-traced quince, two lamps"
 RIM_PX = 2
+VIEW, SHOWN_ERROR = "view.npz", 0.15
 DIGITS = {
     "sam": 4,
     "rmse": 4,
@@ -79,9 +83,11 @@ class CameraShadingTable(PaperTable):
     """Name of the model in the table."""
     only: str = ""
     """Sessions whose names contain this."""
+    picture: Path | None = None
+    """PNG file to draw a held-out view of each session to, by all models of the table. None: none is drawn."""
 
     def main(self) -> None:
-        """Make the table."""
+        """Make the table, and the picture."""
         for name, (scene, effects) in SCENES.items():
             if self.only in name:
                 session = self.output_dir / name.replace(",", "").replace(" ", "-")
@@ -89,6 +95,8 @@ class CameraShadingTable(PaperTable):
         if self.path_traced is not None and self.only in PATH_TRACED:
             data = process_session(self.path_traced, self.output_dir / "path-traced-data")
             self.measured(PATH_TRACED, None, data)
+        if self.picture is not None:
+            draw_views(self.picture, self.output_dir)
 
     def measured(self, name: str, session: Path | None, data: Path) -> None:
         """Train with each seed, judge, and write the row."""
@@ -110,19 +118,20 @@ class CameraShadingTable(PaperTable):
         kept = runs / "judged.json"
         if not kept.is_file():
             config = runs / "shading" / "benchmark" / run.method / "run" / "config.yml"
-            figures = held_out_errors(config, session)
+            figures = held_out_errors(config, session, runs / VIEW)
             figures |= {} if session is None else surface_figures(config, session)
             write_json(kept, figures | {"seconds": run.checkpoints[-1].cpu_seconds})
         scores: dict[str, float] = json.loads(kept.read_text(encoding="utf-8"))
         return scores
 
 
-def held_out_errors(config: Path, session: Path | None) -> dict[str, float]:
+def held_out_errors(config: Path, session: Path | None, kept_view: Path) -> dict[str, float]:
     """SAM and RMSE on the object, and RMSE of its outermost pixels: means over views, against light without noise.
 
     Args:
         config: of the run.
         session: simulated; None for views as measured.
+        kept_view: file that keeps the first view in three bands, for the picture.
     """
     from nerfstudio.utils.eval_utils import eval_setup
 
@@ -141,9 +150,40 @@ def held_out_errors(config: Path, session: Path | None) -> dict[str, float]:
         mask = batch["mask"][..., 0].bool()
         rim = mask & torch.from_numpy(dilate(~mask.numpy(), 2 * RIM_PX + 1))
         metrics = spectral_metrics(rendered, expected, mask)
+        if not found:
+            bands = pipeline.model.rgb_bands
+            shown = {"rendered": rendered[..., bands], "expected": expected[..., bands], "mask": mask}
+            np.savez(kept_view, **{key: value.numpy() for key, value in shown.items()})
         outermost = (rendered - expected)[rim].square().mean().sqrt()
         found.append({"sam": metrics["sam"], "rmse": metrics["rmse"], "rim": float(outermost)})
     return {name: float(np.mean([view[name] for view in found])) for name in found[0]}
+
+
+@rc_context(STYLE)
+def draw_views(path: Path, folder: Path) -> None:
+    """A row for each session: the first held-out view as it is, and by each model, with its error."""
+    found: dict[str, dict[str, dict[str, np.ndarray]]] = {}
+    for file in sorted(folder.glob(f"*-data-*-1/{VIEW}")):
+        session, model = file.parent.name.removesuffix("-1").split("-data-")
+        found.setdefault(session, {})[model.replace("-", " ")] = dict(np.load(file))
+    models = sorted({model for views in found.values() for model in views}, reverse=True)
+    figure = new_figure(2.0 * (1 + 2 * len(models)), 2.1 * len(found))
+    rows = figure.subplots(len(found), 1 + 2 * len(models), squeeze=False)
+    for axes, views in zip(rows, found.values(), strict=True):
+        lines, samples = np.nonzero(next(iter(views.values()))["mask"])
+        crop = slice(lines.min(), lines.max() + 1), slice(samples.min(), samples.max() + 1)
+        for i, model in enumerate(models):
+            truth, rendered = views[model]["expected"][crop], views[model]["rendered"][crop]
+            brightest = np.percentile(truth, 99.5)
+            show_image(axes[0], (truth / brightest).clip(0.0, 1.0))
+            show_image(axes[1 + 2 * i], (rendered / brightest).clip(0.0, 1.0))
+            error = (rendered - truth).mean(axis=-1)
+            show_image(axes[2 + 2 * i], error, cmap="RdBu_r", vmin=-SHOWN_ERROR, vmax=SHOWN_ERROR)
+    rows[0, 0].set_title("held-out view")
+    for i, model in enumerate(models):
+        rows[0, 1 + 2 * i].set_title(f"by the {model}")
+        rows[0, 2 + 2 * i].set_title(f"error, -{SHOWN_ERROR:g} to {SHOWN_ERROR:g}")
+    save_figure(figure, path)
 
 
 def commit_of_the_package() -> str:
