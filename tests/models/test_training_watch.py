@@ -83,7 +83,9 @@ def test_each_stage_has_a_loss_of_its_own_and_must_not_end_with_a_risen_one():
 @pytest.fixture
 def events(tiny_dataset, tmp_path, monkeypatch):
     """Everything that a small run logs."""
-    monkeypatch.setattr("nerfstudio.utils.writer.EVENT_WRITERS", [])  # those of other runs in this process
+    # Neither the writers of other runs in this process, nor what a run that was stopped left to be written.
+    monkeypatch.setattr("nerfstudio.utils.writer.EVENT_WRITERS", [])
+    monkeypatch.setattr("nerfstudio.utils.writer.EVENT_STORAGE", [])
     made = trainer(tiny_dataset, tmp_path, evaluate_stages=True, steps_per_eval_batch=4, steps_per_eval_image=4)
     made.config.logging.steps_per_log = 1
     made.config.full_frame.learn_after = {}
