@@ -181,7 +181,7 @@ def draw_views(path: Path, folder: Path) -> None:
             show_image(axes[2 + 2 * i], error, cmap="RdBu_r", vmin=-SHOWN_ERROR, vmax=SHOWN_ERROR)
     rows[0, 0].set_title("held-out view")
     for i, model in enumerate(models):
-        rows[0, 1 + 2 * i].set_title(f"by the {model}")
+        rows[0, 1 + 2 * i].set_title("by the " + model.split(" in ")[0])
         rows[0, 2 + 2 * i].set_title(f"error, -{SHOWN_ERROR:g} to {SHOWN_ERROR:g}")
     save_figure(figure, path)
 
