@@ -1,6 +1,7 @@
 """Which commands of nerfstudio are adapted, and what they say to runs that they cannot work with."""
 
 import copy
+import errno
 import inspect
 import signal
 import sys
@@ -15,6 +16,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from hsi_sc_nerf import nerfstudio_commands as adapter
 from hsi_sc_nerf.config import hsi_sc_nerf
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.models.run_settings import read_config
 
 
 def command(kind, path, **options):
@@ -137,3 +139,26 @@ def test_ctrl_c_is_one_line_for_our_runs_alone(ours, other, capsys, monkeypatch)
     assert capsys.readouterr().err == "hsi-sc-nerf: stopped.\n"
     with pytest.raises(KeyboardInterrupt):
         stopped(command("ComputePSNR", other))
+
+
+@pytest.mark.parametrize(
+    ("cut_by", "told"),
+    [(OSError(errno.ENOSPC, "No space left on device"), "free some space"), (SystemExit("x"), "x")],
+)
+def test_config_yml_is_written_whole_or_not_at_all(ours, monkeypatch, cut_by, told):
+    before = ours.read_text()
+    config = read_config(ours)
+    config.max_num_iterations += 1
+
+    def cut_short(self, text, **options):
+        self.write_bytes(text[: len(text) // 2].encode())
+        raise cut_by
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_text", cut_short)
+        with pytest.raises(SystemExit, match=told):
+            config.save_config()
+    assert ours.read_text() == before
+    assert [path.name for path in ours.parent.iterdir() if path.is_file()] == ["config.yml"]
+    config.save_config()
+    assert read_config(ours) == config
