@@ -15,7 +15,15 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-_NERFSTUDIO_COMMANDS = ("ns-eval", "ns-export", "ns-render", "ns-train", "ns-viewer")
+_NERFSTUDIO_COMMANDS = {
+    "ns-eval": "eval",
+    "ns-export": "exporter",
+    "ns-render": "render",
+    "ns-train": "train",
+    "ns-viewer": "viewer.run_viewer",
+}
+"""And their scripts, which import this package while they are imported."""
+_SCRIPTS = "nerfstudio.scripts."
 _OWN_METHODS = "hsi-sc-nerf"
 _STOPPED = "hsi-sc-nerf: stopped."
 _AGAIN_S = 0.05
@@ -29,10 +37,11 @@ def end_at_once(line: str) -> None:
 
 def end_nerfstudio_command_at_once() -> None:
     """`end_at_once`, if this process is one of nerfstudio's commands that may be about a run of this package."""
-    name = os.path.splitext(os.path.basename(sys.argv[0]))[0] if sys.argv else ""
-    if name not in _NERFSTUDIO_COMMANDS:
-        return
-    if name != "ns-train" or any(word.startswith(_OWN_METHODS) for word in sys.argv[1:2]):
+    name = os.path.splitext(os.path.basename(sys.argv[0]))[0]
+    if name == "-c":  # as `benchmark.steps.typed_command` calls them
+        name = next((name for name, script in _NERFSTUDIO_COMMANDS.items() if _SCRIPTS + script in sys.modules), "")
+    other_method = name == "ns-train" and not "".join(sys.argv[1:2]).startswith(_OWN_METHODS)
+    if name in _NERFSTUDIO_COMMANDS and not other_method:
         end_at_once(_STOPPED)
 
 

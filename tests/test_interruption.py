@@ -41,10 +41,13 @@ def test_a_command_of_nerfstudio_ends_in_one_line_from_the_moment_that_it_loads_
         (("ns-export", "pointcloud"), True),
         (("ns-train", "nerfacto"), False),
         (("ns-train",), False),
+        (("-c", "hsi-sc-nerf"), True),
+        (("-c", "nerfacto"), False),
         (("notebook", "hsi-sc-nerf"), False),
     ],
 )
 def test_other_programs_and_methods_keep_their_handler(monkeypatch, words, ours):
+    monkeypatch.setattr(sys, "modules", {"nerfstudio.scripts.train": None})
     monkeypatch.setattr(sys, "argv", list(words))
     interruption.end_nerfstudio_command_at_once()
     assert (signal.getsignal(signal.SIGINT) is not signal.default_int_handler) == ours
