@@ -16,6 +16,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from hsi_sc_nerf import nerfstudio_commands as adapter
 from hsi_sc_nerf.config import hsi_sc_nerf
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.models import staged_trainer
 from hsi_sc_nerf.models.run_settings import read_config
 
 
@@ -62,7 +63,8 @@ def test_poisson_estimates_normals_where_the_model_has_none(ours):
     assert made.normal_method == "open3d"
 
 
-def test_a_run_in_the_place_of_a_file_is_one_sentence(tmp_path):
+def test_a_run_in_the_place_of_a_file_is_one_sentence(tmp_path, monkeypatch):
+    monkeypatch.setattr(staged_trainer, "require_data", lambda data: None)
     config = copy.deepcopy(hsi_sc_nerf.config)
     config.output_dir, config.experiment_name, config.timestamp = tmp_path / "file", "x", "run"
     config.output_dir.write_text("months of work")
@@ -154,6 +156,7 @@ def test_config_yml_is_written_whole_or_not_at_all(ours, monkeypatch, cut_by, to
         self.write_bytes(text[: len(text) // 2].encode())
         raise cut_by
 
+    monkeypatch.setattr(staged_trainer, "require_data", lambda data: None)
     with monkeypatch.context() as patch:
         patch.setattr(Path, "write_text", cut_short)
         with pytest.raises(SystemExit, match=told):

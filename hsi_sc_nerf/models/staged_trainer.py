@@ -19,6 +19,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 
 from hsi_sc_nerf import interruption
+from hsi_sc_nerf.data.dataparser import require_data
 from hsi_sc_nerf.errors import InputError, one_sentence
 from hsi_sc_nerf.files import atomic_write, make_folder, write_json
 from hsi_sc_nerf.models.captured_step import CapturedSteps
@@ -111,6 +112,7 @@ class StagedTrainerConfig(TrainerConfig):
         path = self.get_base_dir() / "config.yml"
         CONSOLE.log(f"Saving config to: {path}")
         with one_sentence(), interruption.one_line():
+            require_data(self.pipeline.datamanager)
             make_folder(path.parent)
             with atomic_write(path) as (temporary,):
                 temporary.write_text(yaml.dump(self), encoding="utf-8")
