@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 LONGEST_MESSAGE = 1000
 """A message has at most so many characters; of a longer one, which quotes a damaged file, the middle is left out."""
@@ -24,6 +26,19 @@ class InputError(Exception):
             return text
         half = LONGEST_MESSAGE // 2 - 3
         return f"{text[:half]} ... {text[-half:]}"
+
+
+@contextmanager
+def one_sentence() -> Iterator[None]:
+    """In nerfstudio's commands: InputError in the block ends the process with its sentence, without a traceback.
+
+    Raises:
+        SystemExit: there was one.
+    """
+    try:
+        yield
+    except InputError as error:
+        raise SystemExit(f"hsi-sc-nerf: {error}") from error
 
 
 def shown(value: object) -> str:

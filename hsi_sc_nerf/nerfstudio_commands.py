@@ -10,7 +10,6 @@ they are.
 
 from __future__ import annotations
 
-import signal
 import sys
 import types
 from collections.abc import Callable
@@ -19,8 +18,9 @@ from typing import Any
 from nerfstudio.configs import external_methods
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from hsi_sc_nerf import interruption
 from hsi_sc_nerf.data.dataparser import split_frames
-from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.errors import InputError, one_sentence
 from hsi_sc_nerf.models.checkpoints import find_checkpoint
 from hsi_sc_nerf.models.run_settings import read_config
 from hsi_sc_nerf.models.spectral_model import SpectralModelConfig
@@ -77,26 +77,19 @@ class _ScriptBeingImported(types.ModuleType):
 
 def _adapted(original: Callable[[Any], None]) -> Callable[[Any], None]:
     def main(self: Any) -> None:
-        ours: bool | None = None
-        try:
-            ours = prepare(self)
-            if ours and type(self).__name__ == "ExportPointCloud":
-                _export_spectral_cloud(self)
-            else:
+        with one_sentence():
+            if not prepare(self):
+                interruption.leave_alone()
                 original(self)
-        except InputError as error:
-            raise SystemExit(f"hsi-sc-nerf: {error}") from error
-        except OSError as error:
-            if not ours or error.filename is None:
-                raise
-            raise SystemExit(f"hsi-sc-nerf: {error.filename}: {error.strerror}; choose another path.") from error
-        except KeyboardInterrupt:
-            if ours is False:
-                raise
-            # Another Ctrl-C, while what was begun is ended and cleared away, would only print where it came.
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
-            print("hsi-sc-nerf: stopped.", file=sys.stderr)
-            raise SystemExit(130) from None
+                return
+            try:
+                with interruption.one_line():
+                    _export_spectral_cloud(self) if type(self).__name__ == "ExportPointCloud" else original(self)
+            except OSError as error:
+                if error.filename is None:
+                    raise
+                raise InputError(f"{error.filename}: {error.strerror}; choose another path.") from error
+            interruption.ignore_when_done()
 
     main.__doc__ = original.__doc__
     return main

@@ -1,6 +1,7 @@
 """Which commands of nerfstudio are adapted, and what they say to runs that they cannot work with."""
 
 import copy
+import errno
 import inspect
 import signal
 import sys
@@ -15,6 +16,8 @@ from nerfstudio.engine.trainer import TrainerConfig
 from hsi_sc_nerf import nerfstudio_commands as adapter
 from hsi_sc_nerf.config import hsi_sc_nerf
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.models import staged_trainer
+from hsi_sc_nerf.models.run_settings import read_config
 
 
 def command(kind, path, **options):
@@ -60,7 +63,8 @@ def test_poisson_estimates_normals_where_the_model_has_none(ours):
     assert made.normal_method == "open3d"
 
 
-def test_a_run_in_the_place_of_a_file_is_one_sentence(tmp_path):
+def test_a_run_in_the_place_of_a_file_is_one_sentence(tmp_path, monkeypatch):
+    monkeypatch.setattr(staged_trainer, "require_data", lambda data: None)
     config = copy.deepcopy(hsi_sc_nerf.config)
     config.output_dir, config.experiment_name, config.timestamp = tmp_path / "file", "x", "run"
     config.output_dir.write_text("months of work")
@@ -137,3 +141,27 @@ def test_ctrl_c_is_one_line_for_our_runs_alone(ours, other, capsys, monkeypatch)
     assert capsys.readouterr().err == "hsi-sc-nerf: stopped.\n"
     with pytest.raises(KeyboardInterrupt):
         stopped(command("ComputePSNR", other))
+
+
+@pytest.mark.parametrize(
+    ("cut_by", "told"),
+    [(OSError(errno.ENOSPC, "No space left on device"), "free some space"), (SystemExit("x"), "x")],
+)
+def test_config_yml_is_written_whole_or_not_at_all(ours, monkeypatch, cut_by, told):
+    before = ours.read_text()
+    config = read_config(ours)
+    config.max_num_iterations += 1
+
+    def cut_short(self, text, **options):
+        self.write_bytes(text[: len(text) // 2].encode())
+        raise cut_by
+
+    monkeypatch.setattr(staged_trainer, "require_data", lambda data: None)
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_text", cut_short)
+        with pytest.raises(SystemExit, match=told):
+            config.save_config()
+    assert ours.read_text() == before
+    assert [path.name for path in ours.parent.iterdir() if path.is_file()] == ["config.yml"]
+    config.save_config()
+    assert read_config(ours) == config

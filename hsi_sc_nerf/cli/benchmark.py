@@ -32,7 +32,7 @@ from hsi_sc_nerf.capture.session import is_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import TEMPORARY_PREFIX, content_of, make_folder, read_json, write_json
 from hsi_sc_nerf.models.schedule import Clock
-from hsi_sc_nerf.packed.dataset import TRANSFORMS_NAME, is_packed, open_packed
+from hsi_sc_nerf.packed.dataset import TRANSFORMS_NAME, open_packed, transforms_path
 from hsi_sc_nerf.settings_file import between, check_options
 
 
@@ -157,7 +157,7 @@ def _packed(data: Path) -> Path:
     from hsi_sc_nerf.data.dataparser import processed_dir
     from hsi_sc_nerf.processing.process import process_session
 
-    if not is_packed(data) and is_session(data):
+    if is_session(data) and not transforms_path(data).is_file():
         data = process_session(data, processed_dir(data.resolve()))
     return open_packed(data).root.resolve()
 

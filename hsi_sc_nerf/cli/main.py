@@ -1,18 +1,11 @@
 """The entry of ``hsi-sc-nerf``: whatever goes wrong that a user can mend is one line and an exit status."""
 
-# All else is imported in `_run`: Ctrl-C may come in the seconds that this takes.
-import signal
 import sys
+from typing import Any
 
+from hsi_sc_nerf import interruption
 
-class _Press:
-    """Whether Ctrl-C was pressed: libraries under import turn `KeyboardInterrupt` into exceptions of their own."""
-
-    seen = False
-
-    def __call__(self, number: int, frame: object) -> None:
-        self.seen = True
-        raise KeyboardInterrupt
+_GO_ON = ("ProcessCommand", "RunCommand", "BatchCommand")
 
 
 def main() -> None:
@@ -21,28 +14,22 @@ def main() -> None:
     Invalid input exits with one sentence and status 2, and so does a file that the system refuses; Ctrl-C exits with
     130.
     """
-    press = _Press()
-    commands_run: list[object] = []
+    # All else is imported later: Ctrl-C may come in the seconds that this takes.
+    interruption.end_at_once("Stopped.")
     try:
-        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # it may be ignored, as by nohup
-            signal.signal(signal.SIGINT, press)
-        _run(commands_run)
-        # All is written, and Python takes a moment to end.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-    except BaseException as error:
-        if press.seen or isinstance(error, KeyboardInterrupt):
-            # Another Ctrl-C, while what was begun is ended and cleared away, would only print where it came.
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
-            kinds = {type(command).__name__ for command in commands_run}
-            goes_on = not kinds.isdisjoint(("ProcessCommand", "RunCommand", "BatchCommand"))
-            print(f"Stopped{'; the same command goes on where it stopped' if goes_on else ''}.", file=sys.stderr)
-            sys.exit(130)
+        command = _command()
+        goes_on = "; the same command goes on where it stopped" if type(command).__name__ in _GO_ON else ""
+        with interruption.one_line(lambda: f"Stopped{goes_on}."):
+            command.main()
+    except Exception as error:
         _tell_error(error)
         raise
+    finally:
+        interruption.ignore_when_done()
 
 
-def _run(commands_run: list[object]) -> None:
-    """Run the command, which is appended to ``commands_run`` once it is known."""
+def _command() -> Any:
+    """The command of the command line."""
     from dataclasses import replace
 
     import tyro
@@ -56,11 +43,8 @@ def _run(commands_run: list[object]) -> None:
     if needed == ("batch",):
         # The words that it does not know are Snakemake's.
         command, others = tyro.cli(commands.command_line(needed), return_unknown_args=True)
-        command = replace(command, other_words=tuple(others))
-    else:
-        command = tyro.cli(commands.command_line(needed), description=commands.__doc__)
-    commands_run.append(command)
-    command.main()
+        return replace(command, other_words=tuple(others))
+    return tyro.cli(commands.command_line(needed), description=commands.__doc__)
 
 
 def _tell_error(error: BaseException) -> None:

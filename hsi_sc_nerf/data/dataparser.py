@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -22,7 +22,7 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.capture.session import is_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.packed.dataset import PackedDataset, is_packed, open_packed
+from hsi_sc_nerf.packed.dataset import PackedDataset, open_packed, transforms_path
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
 from hsi_sc_nerf.spectra import nearest_bands
 from hsi_sc_nerf.terminal import ignore_library_warnings
@@ -66,7 +66,7 @@ class SpectralDataParser(DataParser):
 
     def _open(self) -> PackedDataset:
         data = self.config.data
-        if not is_packed(data) and is_session(data):
+        if is_session(data) and not transforms_path(data).is_file():
             return open_packed(process_session(data, processed_dir(data.resolve()), self.config.process))
         return open_packed(data)
 
@@ -142,6 +142,20 @@ def pinhole_cameras(
     )
 
 
+def require_data(manager: Any) -> None:
+    """Refuse, before a run's folder is made, data that are neither a dataset nor a session.
+
+    Args:
+        manager: configuration of the data manager.
+
+    Raises:
+        InputError: they are neither, or a dataset that cannot be read.
+    """
+    data = manager.data or manager.dataparser.data
+    if not is_session(data) or transforms_path(data).is_file():
+        open_packed(data)
+
+
 def processed_dir(session_dir: Path) -> Path:
     """Folder that a session given as ``--data`` is processed into."""
     return session_dir.with_name(session_dir.name + "-processed")
@@ -161,6 +175,8 @@ def split_frames(
         raise InputError(
             f"--train-split-fraction is {train_fraction}; it has to be more than 0, and less than 1 to hold some out."
         )
+    if num_frames < 2:
+        raise InputError("The dataset has one frame; training needs at least one more, to be held out.")
     train_fraction = min(train_fraction, (num_frames - 1) / num_frames)
     train, held_out = get_train_eval_split_fraction([Path(str(i)) for i in range(num_frames)], train_fraction)
     if len(train) == 0 or len(held_out) == 0:

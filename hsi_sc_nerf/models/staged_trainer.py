@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Literal, cast
 
 import torch
+import yaml
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
@@ -17,8 +18,10 @@ from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 
-from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import make_folder, write_json
+from hsi_sc_nerf import interruption
+from hsi_sc_nerf.data.dataparser import require_data
+from hsi_sc_nerf.errors import InputError, one_sentence
+from hsi_sc_nerf.files import atomic_write, make_folder, write_json
 from hsi_sc_nerf.models.captured_step import CapturedSteps
 from hsi_sc_nerf.models.checkpoints import (
     checkpoint_path,
@@ -47,10 +50,10 @@ from hsi_sc_nerf.models.training_watch import (
     RisenLossGuard,
     TrainingDivergedError,
     end_diverged_run,
-    end_stopped_run,
     flush_logs,
     non_finite_names,
     stage_summary,
+    stopped_run,
     training_progress,
 )
 from hsi_sc_nerf.settings_file import between, check_options
@@ -90,7 +93,7 @@ class StagedTrainerConfig(TrainerConfig):
             SystemExit: a setting is impossible, in one sentence.
         """
         stages = (self.full_frame, self.masked)
-        try:
+        with one_sentence():
             check_options(self)
             for stage in stages:
                 for group in (*stage.frozen_groups, *stage.learn_after, *stage.group_lr):
@@ -102,17 +105,17 @@ class StagedTrainerConfig(TrainerConfig):
             if self.max_train_seconds is not None:
                 return plan_seconds(stages, self.max_train_seconds)
             return plan_stages(stages, self.max_num_iterations)
-        except InputError as error:
-            raise SystemExit(f"hsi-sc-nerf: {error}") from error
 
     def save_config(self) -> None:
-        """Check the settings, then write ``config.yml``, the first file of a run."""
+        """Check the settings, then write ``config.yml``, the first file of a run, whole or not at all."""
         self.plan()
-        try:
-            make_folder(self.get_base_dir())
-        except InputError as error:
-            raise SystemExit(f"hsi-sc-nerf: {error}") from error
-        super().save_config()
+        path = self.get_base_dir() / "config.yml"
+        CONSOLE.log(f"Saving config to: {path}")
+        with one_sentence(), interruption.one_line():
+            require_data(self.pipeline.datamanager)
+            make_folder(path.parent)
+            with atomic_write(path) as (temporary,):
+                temporary.write_text(yaml.dump(self), encoding="utf-8")
 
 
 class StagedTrainer(Trainer):
@@ -141,14 +144,10 @@ class StagedTrainer(Trainer):
         self._guard, self._risen_loss = NonFiniteGuard(), RisenLossGuard()
         self._captured: CapturedSteps | None = None
         self.stop_training = False  # nerfstudio sets it when the training begins; single steps read it too
-        try:
+        with one_sentence(), interruption.one_line(self._stopped):
             if path := self._checkpoint_to_load():
                 self._model_config.effects = resumed_effects(self._model_config.effects, path)
             super().setup(test_mode)
-        except InputError as error:
-            raise SystemExit(f"hsi-sc-nerf: {error}") from error
-        except KeyboardInterrupt:
-            end_stopped_run(self.config.get_checkpoint_dir())
         # Evaluation and export build what was trained, whatever becomes of the dataset.
         self._model_config.effects = effects_setting(self._model.effects)
         (config := self.config).save_config()
@@ -179,22 +178,26 @@ class StagedTrainer(Trainer):
     def train(self) -> None:
         """Train the remaining steps of the plan; nerfstudio would add ``max_num_iterations`` to a resumed run."""
         try:
-            if self._loaded is not None and self._keep_stage_of(self._loaded) and self.schedule.complete:
-                return
-            self.config = copy.copy(self.config)
-            self.config.max_num_iterations = self.schedule.require_steps_left(self._start_step)
-            with training_progress(self.schedule) as self._show_progress:
-                super().train()
+            with one_sentence(), interruption.one_line(self._stopped):
+                self._train()
+            interruption.ignore_when_done()
         except TrainingDivergedError as error:
             # Skipped steps do not change the weights: unless the loss had risen before, they are still good.
             self.save_checkpoint(self.step)
             end_diverged_run(error, self.checkpoint_dir)
-        except InputError as error:
-            raise SystemExit(f"hsi-sc-nerf: {error}") from error
-        except KeyboardInterrupt:
-            end_stopped_run(self.config.get_checkpoint_dir())
         finally:
             flush_logs()
+
+    def _train(self) -> None:
+        if self._loaded is not None and self._keep_stage_of(self._loaded) and self.schedule.complete:
+            return
+        self.config = copy.copy(self.config)
+        self.config.max_num_iterations = self.schedule.require_steps_left(self._start_step)
+        with training_progress(self.schedule) as self._show_progress:
+            super().train()
+
+    def _stopped(self) -> str:
+        return stopped_run(self.config.get_checkpoint_dir())
 
     def train_iteration(self, step: int) -> TRAIN_INTERATION_OUTPUT:
         """One step of its stage."""
@@ -317,11 +320,8 @@ class StagedTrainer(Trainer):
             },
         }
         path = checkpoint_path(self.checkpoint_dir, step)
-        try:
-            with self.schedule.clock.paused():
-                write_checkpoint(path, state)
-        except InputError as error:
-            raise SystemExit(f"hsi-sc-nerf: {error}") from error
+        with one_sentence(), self.schedule.clock.paused():
+            write_checkpoint(path, state)
         self._saved_step = step
         if self.config.save_only_latest_checkpoint:
             for older in {*self.checkpoint_dir.glob("*.ckpt")} - {path}:

@@ -7,7 +7,6 @@ above what it was and stays there.
 from __future__ import annotations
 
 import math
-import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -164,16 +163,15 @@ def flush_logs() -> None:
             event_writer.tb_writer.flush()
 
 
-def end_stopped_run(checkpoints: Path) -> NoReturn:
-    """End after Ctrl-C with one line; nerfstudio would print the stack and exit with 0.
+def stopped_run(checkpoints: Path) -> str:
+    """The line that a run ends with after Ctrl-C; nerfstudio would print the stack and exit with 0.
 
     Nothing is saved: a step may be half done, and the weights would not be those of an uninterrupted run.
     """
     saved = any(checkpoints.glob("step-*.ckpt"))
     hint = f"; --load-dir {checkpoints} goes on from the last checkpoint" if saved else ""
     PROFILER.clear()  # or nerfstudio prints its times after this line
-    print(f"hsi-sc-nerf: stopped{hint}.", file=sys.stderr)
-    raise SystemExit(130) from None
+    return f"hsi-sc-nerf: stopped{hint}."
 
 
 def end_diverged_run(error: TrainingDivergedError, checkpoints: Path) -> NoReturn:

@@ -1,9 +1,12 @@
 """How frames are divided between training and evaluation, where the scene lies for the model, what an item holds."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
 
+from hsi_sc_nerf.config import hsi_sc_nerf
 from hsi_sc_nerf.data.datamanager import SpectralDataset
 from hsi_sc_nerf.data.dataparser import SpectralDataParserConfig, scene_scaling, split_frames
 from hsi_sc_nerf.errors import InputError
@@ -24,11 +27,32 @@ def test_held_out_frames_are_spread_evenly():
 
 
 @pytest.mark.parametrize(
-    ("frames", "fraction", "told"), [(10, 1.0, "is 1.0"), (10, -0.1, "is -0.1"), (1, 0.5, "leaves 0")]
+    ("frames", "fraction", "told"),
+    [
+        (10, 1.0, "--train-split-fraction is 1.0"),
+        (10, -0.1, "--train-split-fraction is -0.1"),
+        (1, 0.9, "one frame"),
+    ],
 )
 def test_a_split_without_training_or_held_out_frames_is_refused(frames, fraction, told):
-    with pytest.raises(InputError, match=f"--train-split-fraction.* {told}"):
+    with pytest.raises(InputError, match=told):
         split_frames(frames, fraction)
+
+
+def test_data_is_refused_before_a_run_has_a_folder_and_a_damaged_dataset_is_no_session(tmp_path):
+    """A dataset has ENVI cubes, as a session has."""
+    config = copy.deepcopy(hsi_sc_nerf.config)
+    config.output_dir, config.experiment_name, config.timestamp = tmp_path / "runs", "x", "run"
+    (tmp_path / "data" / "cubes").mkdir(parents=True)
+    (tmp_path / "data" / "cubes" / "a.hdr").write_text("ENVI")
+    (tmp_path / "data" / "transforms.json").write_text('{"frames": [')
+    for data, told in ((tmp_path / "nowhere", "no packed dataset"), (tmp_path / "data", "not a JSON object")):
+        config.pipeline.datamanager.data = data
+        with pytest.raises(SystemExit, match=rf"^hsi-sc-nerf: [^\n]*transforms.json: [^\n]*{told}[^\n]*\.$"):
+            config.save_config()
+        with pytest.raises(SystemExit, match=told):
+            SpectralDataParserConfig(data=data).setup().get_dataparser_outputs("train")
+    assert not config.output_dir.exists()
 
 
 def test_the_scene_fills_the_models_cube():

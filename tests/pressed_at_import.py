@@ -1,0 +1,28 @@
+"""A process in which Ctrl-C comes just when a library is about to be loaded."""
+
+import os
+import signal
+import subprocess
+import sys
+
+_PRESSES = """
+import signal, sys
+library, *sys.argv = sys.argv[1:]
+class Presses:
+    def find_spec(self, name, path=None, target=None):
+        if name == library:
+            signal.raise_signal(signal.SIGINT)
+sys.meta_path.insert(0, Presses())
+"""
+
+
+def run(library, code, words):
+    """The ended process, which ran ``code`` as a command that was called with ``words``."""
+    return subprocess.run(
+        [sys.executable, "-c", _PRESSES + code, library, *words],
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"TERM": "dumb"},
+        # Tests may run in the background of a shell, which has it ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
