@@ -206,9 +206,17 @@ def some_lines(cube: Cube) -> Num[np.ndarray, "rows samples bands"]:
 def light_of_some_lines(cube: Cube, dark: Cube | None) -> Float[np.ndarray, "rows samples bands"]:
     """Counts above dark of ``SOME_LINES`` lines of a cube (`spread_rows`); 0 for no data."""
     counts = np.asarray(cube.memmap()[spread_rows(cube.shape[0], SOME_LINES)])
-    missing = no_data(counts, cube.ignore_value)
-    dark_lines = None if dark is None else dark.memmap()[:SOME_LINES]
-    light = counts.astype(np.float32) - dark_columns(dark_lines, *cube.shape[1:]).astype(np.float32)
+    return light_above(counts, None if dark is None else some_lines(dark), cube.ignore_value)
+
+
+def light_above(
+    counts: Num[np.ndarray, "lines samples bands"],
+    dark: Num[np.ndarray, "dark_lines dark_samples bands"] | None,
+    ignore_value: float | None,
+) -> Float[np.ndarray, "lines samples bands"]:
+    """Counts above dark; 0 for no data."""
+    missing = no_data(counts, ignore_value)
+    light = counts.astype(np.float32) - dark_columns(dark, *counts.shape[1:]).astype(np.float32)
     return light if missing is None else np.where(missing, np.float32(0.0), light)
 
 

@@ -5,6 +5,7 @@ Materials have none: a line that all pixels of the frames show over the white is
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -20,15 +21,20 @@ LINE_AMBER, LINE_RED = 0.03, 0.1
 """Height of a line over the reflectance beside it, as a fraction. Good sessions have less than 0.005."""
 WINDOW_NM, LARGEST_STEP_NM, FEWEST_BANDS = 45.0, 6.0, 40
 """Span in which reflectance is compared, more than twice a line's width; and bands that tell of lines."""
-FRAMES, BRIGHT, PIXELS = 8, 0.3, 2000
-"""Frames, fraction of the brightest pixels' light from which pixels are compared, and so many of a frame."""
+FRAMES, BRIGHT, PIXELS = 8, 0.3, 250
+"""Frames, fraction of the brightest pixels' light from which pixels are compared, and about so many of a frame."""
 
 
-def check_lines(session: Session, source: Literal["auto"] | WhiteSource = "auto") -> list[Finding]:
+def check_lines(
+    session: Session,
+    frames: Sequence[Float[np.ndarray, "pixels bands"]],
+    source: Literal["auto"] | WhiteSource = "auto",
+) -> list[Finding]:
     """The finding ``light-lines``, for sessions with narrow bands and a white of their own.
 
     Args:
         session: its captures.
+        frames: counts above dark of brighter pixels of each frame (`bright_pixels`).
         source: where the white is.
 
     Raises:
@@ -43,10 +49,7 @@ def check_lines(session: Session, source: Literal["auto"] | WhiteSource = "auto"
     white = bright_pixels(light_of_some_lines(cube, dark)).mean(axis=0)
     lit = ~unlit_bands(white[None]) & cube.good_bands
     chosen = np.unique(np.linspace(0, len(session.frames) - 1, FRAMES).astype(int)).tolist()
-    spectra = [
-        bright_pixels(light_of_some_lines(frame.cube, frame.dark))[:, lit] / white[lit]
-        for frame in (session.frames[number] for number in chosen)
-    ]
+    spectra = [frames[number][:, lit] / white[lit] for number in chosen]
     window = 2 * round(WINDOW_NM / 2.0 / float(np.median(steps_nm))) + 1
     height = line_heights(np.concatenate(spectra), window)
     worst = int(np.abs(height).argmax())

@@ -48,6 +48,11 @@ def test_a_dark_reference_with_light(folder, name, light, level):
     assert finding.values["light_over_white"][name] == pytest.approx(light, rel=0.05, abs=0.001)
 
 
+def test_spectra_that_were_read_before_are_taken(folder):
+    opened = open_session(folder)
+    assert check_dark(opened, "auto", {"ball_2": DARK + 0.05 * LAMP, "ball_3": None}).level == "red"
+
+
 def test_all_darks_with_light_the_whites_own_too(folder):
     for name in ("ball_1", "ball_2", "ball_3", "ball_4", "white_reference"):
         write_dark(folder, name, 0.03)

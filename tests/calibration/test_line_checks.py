@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from hsi_sc_nerf.calibration.line_checks import check_lines, line_heights
+from hsi_sc_nerf.calibration.detector import light_of_some_lines
+from hsi_sc_nerf.calibration.line_checks import bright_pixels, check_lines, line_heights
 from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.capture.session import open_session
 
@@ -33,24 +34,29 @@ def session(folder, on_white=1.0, on_frames=1.0):
     return open_session(folder)
 
 
+def found(opened):
+    frames = [bright_pixels(light_of_some_lines(frame.cube, frame.dark)) for frame in opened.frames]
+    return check_lines(opened, frames)
+
+
 def test_materials_and_lamps_that_both_see_have_no_lines(tmp_path):
-    assert check_lines(session(tmp_path / "plain"))[0].level == "green"
+    assert found(session(tmp_path / "plain"))[0].level == "green"
     both = 1.0 + 0.5 * (LINES - 1.0)
-    assert check_lines(session(tmp_path / "both", both, both))[0].level == "green"
+    assert found(session(tmp_path / "both", both, both))[0].level == "green"
     # A leaf alone, with its steep edge, before no wall.
     assert np.abs(line_heights(LEAF[None], 15)).max() < 0.025
 
 
 @pytest.mark.parametrize(("strength", "level"), [(0.06, "amber"), (0.4, "red")])
 def test_a_lamp_that_shone_on_the_frames_only(tmp_path, strength, level):
-    (finding,) = check_lines(session(tmp_path, on_frames=1.0 + strength * (LINES - 1.0)))
+    (finding,) = found(session(tmp_path, on_frames=1.0 + strength * (LINES - 1.0)))
     assert finding.level == level
     assert "the frames only" in finding.sentence
     assert finding.values["value"] == pytest.approx(strength, rel=0.3)
 
 
 def test_a_lamp_that_shone_on_the_white_only(tmp_path):
-    (finding,) = check_lines(session(tmp_path, on_white=1.0 + 0.3 * (LINES - 1.0)))
+    (finding,) = found(session(tmp_path, on_white=1.0 + 0.3 * (LINES - 1.0)))
     assert finding.level == "red"
     assert "the white only" in finding.sentence
 
@@ -60,4 +66,4 @@ def test_few_broad_bands_tell_nothing(tmp_path):
     for capture in opened.captures:
         for cube in capture.cubes:
             write_cube(cube.header_path, cube.read()[..., ::8], wavelengths_nm=BANDS_NM[::8])
-    assert check_lines(open_session(tmp_path)) == []
+    assert found(open_session(tmp_path)) == []
