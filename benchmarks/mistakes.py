@@ -258,6 +258,12 @@ def _sized(factor: float, container: bool) -> Callable[[Path, Path, Path], None]
     return make
 
 
+def _sized_with_distance(session: Path, source: Path, other: Path) -> None:
+    _sized(1.1, container=False)(session, source, other)
+    camera = next(iter(SessionTruth.of(source).poses.values()))
+    _state(session, camera_distance_m=float(np.linalg.norm(camera[:2, 3])))
+
+
 def _other_direction(session: Path, source: Path, other: Path) -> None:
     _state(session, direction="ccw" if stated(session)["direction"] == "cw" else "cw")
 
@@ -313,6 +319,7 @@ MISTAKES = [
     Mistake("marker side in cm", _sized(100.0, container=False)),
     Mistake("marker side 10 % too long, container stated", _sized(1.1, container=True)),
     Mistake("marker side 10 % too long, no other length", _sized(1.1, container=False)),
+    Mistake("marker side 10 % too long, camera distance stated", _sized_with_distance),
     Mistake("the other direction stated", _other_direction),
     Mistake("frames exposed half as long as stated", _half_exposed),
     Mistake("stray light of 5 % over all frames", _veil(0.05)),
