@@ -17,6 +17,8 @@ import tyro
 from results_table import RESULTS, write_results
 from session_mistakes import run_command
 
+from hsi_sc_nerf.capture.envi import open_cube, write_cube
+
 COLUMNS = ["session", "effects", "inspect: status", "process: status", "red", "amber"]
 SIZE_PX, FRAMES = 112, 24
 NOISE = ("photon_noise", "read_noise", "dark_pattern")
@@ -36,7 +38,7 @@ SESSIONS: dict[str, tuple[str, ...]] = {
 }
 """Effects beside noise, by scene and seed."""
 KERNEL = "4-22-22_right_same_B73_top_00"
-KERNEL_CUBES = {KERNEL: "kernel", "white_reference_crop": "white_reference", "dark_reference_crop": "DARKREF_kernel"}
+REFERENCES = ("white_reference_crop", "dark_reference_crop")
 REAL = Path(__file__).parents[1] / "tests" / "real_cubes" / "maize_kernel"
 
 
@@ -89,13 +91,12 @@ class CleanSessions:
 
 
 def _kernel(session: Path) -> Path:
-    """A session of one frame from the real cubes."""
-    session.mkdir(parents=True, exist_ok=True)
-    for source, name in KERNEL_CUBES.items():
-        for suffix in (".hdr", ".raw"):
-            shutil.copy(REAL / f"{source}{suffix}", session / f"{name}{suffix}")
-    for suffix in (".hdr", ".raw"):
-        shutil.copy(session / f"DARKREF_kernel{suffix}", session / f"DARKREF_white_reference{suffix}")
+    """A session of the real cubes: the kernel, and as a second frame the same upside down."""
+    kernel, white, dark = (open_cube(REAL / f"{name}.hdr") for name in (KERNEL, *REFERENCES))
+    frames = {"kernel_1": kernel.read(), "kernel_2": kernel.read()[::-1], "white_reference": white.read()}
+    for name, counts in frames.items():
+        write_cube(session / f"{name}.hdr", counts, wavelengths_nm=kernel.wavelengths_nm)
+        write_cube(session / f"DARKREF_{name}.hdr", dark.read(), wavelengths_nm=kernel.wavelengths_nm)
     return session
 
 

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.calibration.detector import some_lines
+from hsi_sc_nerf.calibration.detector import some_lines, unlit_bands
 from hsi_sc_nerf.calibration.white_source import WhiteSource, checked_source, white_cubes
 from hsi_sc_nerf.capture.envi import Cube
 from hsi_sc_nerf.capture.session import Session
@@ -80,13 +80,13 @@ def check_dark(
         advice = f" or leave out with {leave_out(frames)}" if 0 < len(frames) < len(session.frames) else ""
         return Finding("dark", "red", f"{sentence}{advice}.", {"without": without})
     white = np.percentile(some_lines(white_cubes(session, found)[0]), 95.0, axis=(0, 1))
-    lit = {}
+    with_data, lit = ~unlit_bands(white[None]), {}
     for exposure in exposures:
         assert exposure.dark is not None
         dark = (spectra or {}).get(exposure.name)
-        lit[exposure.name] = light_over_white(
-            some_lines(exposure.dark).mean(axis=(0, 1)) if dark is None else dark, white
-        )
+        if dark is None:
+            dark = some_lines(exposure.dark).mean(axis=(0, 1))
+        lit[exposure.name] = light_over_white(dark[with_data], white[with_data])
     values: dict[str, object] = {"light_over_white": {name: round(value, 5) for name, value in lit.items()}}
     shining = [name for name, value in lit.items() if value > LIT_AMBER]
     if shining:

@@ -154,13 +154,13 @@ def unlit_bands(light: Float[np.ndarray, "columns bands"]) -> Bool[np.ndarray, "
 def dark_columns(
     dark: Num[np.ndarray, "dark_lines dark_samples bands"] | None, samples: int, bands: int
 ) -> Float[np.ndarray, "columns bands"]:
-    """Counts without light of each sample: the mean over the dark cube's lines; 0 without a dark cube.
+    """Counts without light of each sample: the mean over the dark cube's lines with data; 0 without a dark cube.
 
     A dark cube of another width cannot be matched by sample and gives one spectrum (columns = 1).
     """
     if dark is None:
         return np.zeros((1, bands))
-    columns = dark.mean(axis=0, dtype=np.float64)
+    columns = fill_no_data(np.asarray(dark), None).mean(axis=0, dtype=np.float64)
     return columns if len(columns) == samples else columns.mean(axis=0, keepdims=True)
 
 

@@ -24,7 +24,7 @@ USUAL, POSSIBLE = (0.3, 1.15), (0.1, 2.0)
 """Ranges of the paper's reflectance: paper that lies before lamps from above has 0.4 to 1, in shade less."""
 INK_PERCENTILE = 10.0
 """About half of a marker is black, a fifth far enough from white."""
-VEIL_AMBER, VEIL_RED = 0.15, 0.3
+VEIL_AMBER, VEIL_RED = 0.15, 0.2
 """Ink's brightness over that of the paper. Printed black has 0.04 to 0.1."""
 
 
