@@ -22,8 +22,8 @@ LEAST_SIDE_PX = 10.0
 """Of smaller markers no pixel shows paper alone."""
 USUAL, POSSIBLE = (0.3, 1.15), (0.1, 2.0)
 """Ranges of the paper's reflectance: paper that lies before lamps from above has 0.4 to 1, in shade less."""
-INK_PERCENTILE = 10.0
-"""About half of a marker is black, a fifth far enough from white."""
+INK_PERCENTILE, BLACKEST_MARKERS = 2.0, 25.0
+"""Blur brightens black cells, those that stand alone and those of small markers most."""
 VEIL_AMBER, VEIL_RED = 0.15, 0.2
 """Ink's brightness over that of the paper. Printed black has 0.04 to 0.1."""
 
@@ -51,7 +51,11 @@ def check_paper(session: Session, quicklooks: Sequence[Quicklook], detections: S
         return []
     ink, paper = np.array(found).T
     of_paper = [] if session.white is None else [_of_paper(session, float(np.median(paper)), len(found))]
-    return [*of_paper, _veil(session, float(np.median(ink / np.maximum(paper, 1e-6))), len(found))]
+    # Of few and far markers blur tells more than light does.
+    if len(found) < len(session.frames):
+        return of_paper
+    ratio = float(np.percentile(ink / np.maximum(paper, 1e-6), BLACKEST_MARKERS))
+    return [*of_paper, _veil(session, ratio, len(found))]
 
 
 def _of_paper(session: Session, paper: float, markers: int) -> Finding:
@@ -75,7 +79,7 @@ def _veil(session: Session, ink: float, markers: int) -> Finding:
     sentence = f"{session.path}: the markers' black is {100.0 * ink:.0f} % as bright as their white"
     advice = (
         "stray light lies over the frames and adds to every reflectance (a lamp in view, a dirty lens or window, an "
-        "open chamber), unless the print is grey; shade the lens, or print the markers anew"
+        "open chamber), unless the print is grey or blurred; shade the lens, or print the markers anew"
     )
     finding = judged("veil", ink, (VEIL_AMBER, VEIL_RED), sentence, advice)
     return replace(finding, values={**finding.values, "markers": markers})
