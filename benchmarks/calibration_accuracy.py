@@ -24,7 +24,7 @@ from calibration_score import CalibrationScore, lamp_output, score_calibration
 from jaxtyping import Float, UInt16
 from results_table import RESULTS, write_results
 from rich.progress import track
-from session_mistakes import SessionTruth
+from session_truth import SessionTruth
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.calibration.lamp_drift import LampDriftEstimate, NotMeasurable

@@ -10,22 +10,22 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import tyro
+from mistakes import MISTAKES, WALL, Mistake, edit_headers, replaced_frames
 from results_table import RESULTS, write_results
+from session_truth import SessionTruth
 
 from hsi_sc_nerf.geometry.camera import rotation_angle_deg
 from hsi_sc_nerf.packed.dataset import open_packed
-from hsi_sc_nerf.simulate.truth import load_truth
 
 COLUMNS = [
     "session",
@@ -44,20 +44,7 @@ COLUMNS = [
 ]
 SIZE_PX, FRAMES = 112, 24
 EFFECTS = ("photon_noise", "read_noise", "dark_pattern", "chamber_shading", "lamp_drift")
-OTHER_DAY = "26-10-2026"
 LONGEST_SENTENCE = 200
-
-
-@dataclass(frozen=True)
-class Mistake:
-    """One mistake, and the words with which `process` is called."""
-
-    name: str
-    make: Callable[[Path, Path], None]
-    """Makes it in the folder of a session; the second folder is a session of another object, of two frames."""
-    words: tuple[str, ...] = ()
-    replaces_frames: bool = False
-    """Whether it replaces frames, which then do not count in the errors."""
 
 
 @dataclass(frozen=True)
@@ -108,8 +95,8 @@ class SessionMistakes:
             found.append(self.output_dir / f"{name}{suffix}")
             if not found[-1].is_dir():
                 words = ["simulate", scene, str(found[-1]), "--frames", str(frames), "--size", str(SIZE_PX)]
-                _command([*words, "--effects", *EFFECTS, *effects])
-                _edit_headers(found[-1], "(?m)^(byte order.*)$", r"\1" "\nacquisition date = 14-10-2026")
+                run_command([*words, "--effects", *EFFECTS, *effects])
+                edit_headers(found[-1], "(?m)^(byte order.*)$", r"\1" "\nacquisition date = 14-10-2026")
         return found[0], found[1]
 
     def _judged(self, mistake: Mistake, session: Path, other: Path) -> list[str]:
@@ -118,20 +105,27 @@ class SessionMistakes:
         for folder in (made, data):
             shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(session, made, ignore=shutil.ignore_patterns("truth"))
-        mistake.make(made, other)
-        inspected, _, inspect_s = _command(["inspect", str(made), "--output-dir", str(data / "report")])
+        mistake.make(made, session, other)
+        inspected, _, inspect_s = run_command(["inspect", str(made), "--output-dir", str(data / "report")])
         found = data / "report" / "inspection.json"
         findings = json.loads(found.read_text(encoding="utf-8"))["findings"] if found.is_file() else []
         red = ", ".join(dict.fromkeys(finding["name"] for finding in findings if finding["level"] == "red"))
         shutil.rmtree(data, ignore_errors=True)
-        processed, said, process_s = _command(["process", str(made), "--output-dir", str(data), *mistake.words])
-        replaced = [frame.name for frame in _replaced(session)] if mistake.replaces_frames else []
+        processed, said, process_s = run_command(["process", str(made), "--output-dir", str(data), *mistake.words])
+        replaced = [frame.name for frame in replaced_frames(session)] if mistake.replaces_frames else []
         errors = measured_errors(data, session, replaced) if processed == 0 else [""] * 5
         sentence = said.replace(str(made), "SESSION")
         if len(sentence) > LONGEST_SENTENCE:
             sentence = f"{sentence[:LONGEST_SENTENCE]} ..."
-        said = "" if processed == 0 else sentence
+        said = _amber(data) if processed == 0 else sentence
         return [str(inspected), red, f"{inspect_s:.0f}", str(processed), said, *errors, f"{process_s:.0f}"]
+
+
+def _amber(data: Path) -> str:
+    """The names of the amber findings of a dataset."""
+    found = json.loads((data / "report" / "inspection.json").read_text(encoding="utf-8"))["findings"]
+    names = dict.fromkeys(one["name"] for one in found if one["level"] == "amber")
+    return f"amber: {', '.join(names)}" if names else ""
 
 
 def measured_errors(data: Path, session: Path, left_out: Sequence[str] = ()) -> list[str]:
@@ -157,128 +151,7 @@ def measured_errors(data: Path, session: Path, left_out: Sequence[str] = ()) -> 
     return [f"{turned:.3f}", f"{1e3 * moved_m:.2f}", f"{focal:+.2f}", f"{min(ious):.3f}", off]
 
 
-@dataclass(frozen=True)
-class SessionTruth:
-    """What is known of a path-traced or a simulated session."""
-
-    poses: dict[str, np.ndarray]
-    focal_px: float
-    wavelengths_nm: np.ndarray
-    drift: dict[str, np.ndarray]
-    """Light of the lamps in each band, by capture."""
-    coverage: Callable[[str], np.ndarray]
-    """Fraction of each pixel (h, w) that the object covers, of a capture."""
-
-    @classmethod
-    def of(cls, session: Path) -> SessionTruth:
-        """Read the truth beside a session."""
-        masks = session / "truth" / "masks.npz"
-        if masks.is_file():
-            values = json.loads((session / "truth" / "truth.json").read_text(encoding="utf-8"))
-            coverage = dict(np.load(masks))
-            return cls(
-                {frame["capture"]: np.array(frame["camera_to_world"]) for frame in values["frames"]},
-                values["intrinsics"]["fl_x"],
-                np.array(values["wavelengths_nm"]),
-                {frame["capture"]: np.array(frame["drift"]) for frame in values["frames"]},
-                lambda capture: coverage[capture],
-            )
-        truth = load_truth(session)
-        lamps = {name: np.prod([f[0, 0] for f in truth.light(name).illumination], axis=0) for name in truth.captures}
-        poses = dict(zip(truth.captures, truth.camera_to_world, strict=True))
-        return cls(poses, truth.intrinsics.fl_x, truth.wavelengths_nm, lamps, truth.object_coverage)
-
-
-def _nothing(session: Path, other: Path) -> None:
-    pass
-
-
-def _frame_as_white(session: Path, other: Path) -> None:
-    white, frame = session / _stated(session)["white_reference"], _frames(session)[3]
-    for path in (frame / "capture").iterdir():
-        shutil.copy(path, white / "capture" / path.name.replace(frame.name, white.name))
-
-
-def _another_day(session: Path, other: Path) -> None:
-    for frame, of_other in zip(_replaced(session), _frames(other), strict=True):
-        for path in (of_other / "capture").iterdir():
-            shutil.copy(path, frame / "capture" / path.name.replace(of_other.name, frame.name))
-        _edit_headers(frame, r"acquisition date = .*", f"acquisition date = {OTHER_DAY}")
-
-
-def _replaced(session: Path) -> list[Path]:
-    """The frames at the angles of the other object's two."""
-    frames = _frames(session)
-    return [frames[0], frames[len(frames) // 2]]
-
-
-def _another_object(session: Path, other: Path) -> None:
-    _another_day(session, other)
-    _edit_headers(session, r"acquisition date = .*", f"acquisition date = {OTHER_DAY}")
-
-
-def _without_folder(session: Path, other: Path) -> None:
-    frame = _frames(session)[4]
-    for path in (frame / "capture").iterdir():
-        path.rename(frame / path.name)
-    (frame / "capture").rmdir()
-
-
-def _empty_capture(session: Path, other: Path) -> None:
-    for path in (_frames(session)[4] / "capture").iterdir():
-        path.unlink()
-
-
-def _empty_file(session: Path, other: Path) -> None:
-    frame = _frames(session)[4]
-    (frame / "capture" / f"{frame.name}.raw").write_bytes(b"")
-
-
-def _no_session_json(session: Path, other: Path) -> None:
-    (session / "session.json").unlink()
-
-
-def _upright_in_specim_iq_folders(session: Path, other: Path) -> None:
-    stated = _stated(session)
-    del stated["image_rotation_deg"]
-    (session / "session.json").write_text(json.dumps(stated), encoding="utf-8")
-    for path in [*session.rglob("*.hdr"), *session.rglob("*.xml")]:
-        text = path.read_text(encoding="utf-8")
-        path.write_text(text.replace("simulated SPECIM IQ", "SPECIM IQ"), encoding="utf-8")
-
-
-WALL = Mistake("textured wall", _nothing)
-MISTAKES = [
-    Mistake("none", _nothing),
-    WALL,
-    Mistake("none, --poses colmap", _nothing, ("--poses", "colmap")),
-    Mistake("white is one of the frames", _frame_as_white),
-    Mistake("two frames of another day and object", _another_day, replaces_frames=True),
-    Mistake("two frames of another object", _another_object, replaces_frames=True),
-    Mistake("a capture without capture/", _without_folder),
-    Mistake("one empty capture", _empty_capture),
-    Mistake("one empty capture, --skip-damaged", _empty_capture, ("--skip-damaged",)),
-    Mistake("a file of 0 bytes", _empty_file),
-    Mistake("no session.json", _no_session_json),
-    Mistake("upright pictures as SPECIM IQ", _upright_in_specim_iq_folders),
-]
-
-
-def _stated(session: Path) -> dict[str, str]:
-    return json.loads((session / "session.json").read_text(encoding="utf-8"))
-
-
-def _frames(session: Path) -> list[Path]:
-    white = _stated(session)["white_reference"]
-    return sorted(path.parent for path in session.glob("*/capture") if path.parent.name != white)
-
-
-def _edit_headers(folder: Path, pattern: str, replacement: str) -> None:
-    for path in folder.rglob("*.hdr"):
-        path.write_text(re.sub(pattern, replacement, path.read_text(encoding="utf-8")), encoding="utf-8")
-
-
-def _command(words: list[str]) -> tuple[int, str, float]:
+def run_command(words: list[str]) -> tuple[int, str, float]:
     """Status, last sentence and seconds of a command of ours."""
     started = time.perf_counter()
     environment = os.environ | {"COLUMNS": "1000", "PYTHONWARNINGS": "ignore"}

@@ -125,7 +125,7 @@ def read_json(path: Path, remedy: str) -> dict[str, Any]:
         InputError: the file cannot be read or is not a JSON object.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
         # JSON can spell halves of characters, which no file can be written with.
         json.dumps(content, ensure_ascii=False).encode("utf-8")
     except OSError as error:

@@ -71,6 +71,12 @@ def test_what_is_no_json_object_is_refused_in_a_sentence(tmp_path, text):
         read_json(path, "mend it")
 
 
+def test_json_of_a_windows_editor(tmp_path):
+    path = tmp_path / "a.json"
+    path.write_bytes('{\r\n"object": "Äpfel"\r\n}\r\n'.encode("utf-8-sig"))
+    assert read_json(path, "mend it") == {"object": "Äpfel"}
+
+
 def test_what_a_killed_process_left_is_deleted_and_what_a_running_one_writes_is_kept(tmp_path):
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()

@@ -5,8 +5,8 @@ They are read from a table, which may name an ONNX model. It is described in doc
 
 from __future__ import annotations
 
-import csv
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -19,6 +19,7 @@ from hsi_sc_nerf.analysis.maps import SurfaceMap
 from hsi_sc_nerf.analysis.preprocessing import Step, preprocessed, read_steps
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.number_table import number_in, numbers_in, read_number_table
 from hsi_sc_nerf.spectra import nearest_bands
 
 _KEYS = {
@@ -201,19 +202,19 @@ def read_calibration(path: Path | str) -> Calibration:
             raise ValueError("it needs a column wavelength_nm that ascends")
         coefficients = columns.get("coefficient", np.ones(len(nm)))
         used = np.isfinite(coefficients)
-        steps = read_steps(head.get("preprocessing", ""), used)
+        steps = read_steps(head.get("preprocessing", "").replace(";", ","), used)
         reference = columns.get("reference", np.full(len(nm), np.nan))
         if any(name == "msc" for name, _ in steps) and not np.isfinite(reference).all():
             raise ValueError("msc needs a column reference")
-        numbers = {key: float(head.get(key, default)) for key, default in (("intercept", 0.0), ("error", 0.0))}
+        numbers = {key: number_in(head.get(key, "0")) for key in ("intercept", "error")}
         if not (all(map(math.isfinite, numbers.values())) and numbers["error"] >= 0.0 and used.any()):
             raise ValueError("its intercept and error are no finite numbers, or it has no coefficient")
         domain = _domain(head, {name: column[used] for name, column in columns.items()})
         column = int(head.get("column", 0))
-        classes = tuple(word.strip() for word in head.get("classes", "").split(",") if word.strip())
+        classes = tuple(word.strip() for word in re.split("[,;]", head.get("classes", "")) if word.strip())
         if classes and (len(classes) < 2 or len(set(classes)) < len(classes) or "model" not in head):
             raise ValueError("classes needs two names or more, each once, and a model that gives their probabilities")
-    except (ValueError, OSError, UnicodeDecodeError, csv.Error) as error:
+    except (ValueError, OSError) as error:
         raise InputError(f"{path}: is no table of a calibration ({error}); {_REMEDY}.") from error
     if "model" in head:
         predict = _onnx_model(path, head["model"], int(used.sum()), slice(column, column + max(1, len(classes))))
@@ -230,16 +231,9 @@ def read_calibration(path: Path | str) -> Calibration:
 
 def _read_table(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
     """``# key: value`` lines, and the columns by name; empty cells are NaN."""
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        lines = [line for line in file if line.strip()]
-    pairs = (line.lstrip("# ").partition(":") for line in lines if line.startswith("#") and ":" in line)
-    head = {key.strip().lower(): value.strip() for key, _, value in pairs}
-    titles, *rows = [*csv.reader(line for line in lines if not line.startswith("#"))] or [[]]
-    if any(len(row) != len(titles) for row in rows):
-        raise ValueError("its lines do not have the same number of columns")
-    cells = [[math.nan if cell.strip() in ("", "NA") else float(cell) for cell in row] for row in rows]
-    table = np.array(cells, float).reshape(len(rows), len(titles))
-    return head, {title.strip(): column for title, column in zip(titles, table.T, strict=True)}
+    table = read_number_table(path)
+    pairs = (note.partition(":") for note in table.notes if ":" in note)
+    return {key.strip().lower(): value.strip(" ;,\t") for key, _, value in pairs}, table.by_title()
 
 
 def _domain(head: dict[str, str], columns: dict[str, np.ndarray]) -> Domain | None:
@@ -248,7 +242,7 @@ def _domain(head: dict[str, str], columns: dict[str, np.ndarray]) -> Domain | No
     Raises:
         ValueError: the table lacks what the limit needs.
     """
-    limits = [float(head.get(key, "inf")) for key in ("t2_limit", "q_limit")]
+    limits = [number_in(head.get(key, "inf")) for key in ("t2_limit", "q_limit")]
     if not (limits[0] < math.inf or limits[1] < math.inf):
         return None
     weights, loadings = (
@@ -257,7 +251,7 @@ def _domain(head: dict[str, str], columns: dict[str, np.ndarray]) -> Domain | No
     )
     if "mean" not in columns or weights is None or loadings is None or weights.shape != loadings.shape:
         raise ValueError("t2_limit and q_limit need the columns mean, weight_1 ... and as many of loading_1 ...")
-    variances = np.array([float(word) for word in head.get("score_variances", "").split(",") if word.strip()])
+    variances = np.array(numbers_in(head.get("score_variances", "")))
     if limits[0] < math.inf and not (len(variances) == weights.shape[1] and (variances > 0.0).all()):
         raise ValueError("t2_limit needs score_variances, one above 0 for each weight")
     scale = columns.get("scale", np.ones(len(weights)))

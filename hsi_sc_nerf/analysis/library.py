@@ -18,6 +18,7 @@ from spectral.io import envi
 from hsi_sc_nerf.capture.envi_header import read_header
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write
+from hsi_sc_nerf.number_table import read_number_table
 
 # Wavelengths of a table that are all below this are in micrometres.
 _SMALLEST_NM = 100.0
@@ -130,21 +131,19 @@ def write_library(path: Path | str, library: SpectralLibrary) -> None:
 
 def _read_table(path: Path) -> tuple[list[str], np.ndarray, np.ndarray]:
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            header, *rows = [row for row in csv.reader(file) if row]
-        table = np.array(rows, float)
-        if table.ndim != 2 or table.shape[1] != len(header) or len(header) < 2:
-            raise ValueError("its lines do not have the same number of columns")
-        if not np.isfinite(table).all():
-            raise ValueError("it holds numbers that are not finite")
+        table = read_number_table(path)
+        if len(table.titles) < 2 or len(table.numbers) == 0:
+            raise ValueError("it has no names, or no columns and lines below them")
+        if not np.isfinite(table.numbers).all():
+            raise ValueError("it holds numbers that are not finite, or empty cells")
     except (ValueError, OSError) as error:
         raise InputError(
             f"{path}: is no table of spectra ({error}); give names in the first line, wavelengths in nm in the first "
             "column, and a spectrum in each other column."
         ) from error
-    wavelengths = table[:, 0]
+    wavelengths = table.numbers[:, 0]
     nm_per_unit = 1000.0 if wavelengths.max() < _SMALLEST_NM else 1.0
-    return [name.strip() for name in header[1:]], wavelengths * nm_per_unit, table[:, 1:].T
+    return list(table.titles[1:]), wavelengths * nm_per_unit, table.numbers[:, 1:].T
 
 
 def _read_envi(path: Path) -> tuple[list[str], np.ndarray, np.ndarray]:

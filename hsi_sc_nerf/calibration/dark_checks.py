@@ -6,14 +6,14 @@ as much. Light in it has the spectrum of the light on the white.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.calibration.detector import some_lines
+from hsi_sc_nerf.calibration.detector import some_lines, unlit_bands
 from hsi_sc_nerf.calibration.white_source import WhiteSource, checked_source, white_cubes
 from hsi_sc_nerf.capture.envi import Cube
 from hsi_sc_nerf.capture.session import Session
@@ -46,12 +46,17 @@ class _Exposure:
         return max(dark_ms, self.counts_ms) > OTHER_TIME * min(dark_ms, self.counts_ms)
 
 
-def check_dark(session: Session, source: Literal["auto"] | WhiteSource = "auto") -> Finding:
+def check_dark(
+    session: Session,
+    source: Literal["auto"] | WhiteSource = "auto",
+    spectra: Mapping[str, Float[np.ndarray, "bands"] | None] | None = None,
+) -> Finding:
     """The finding ``dark``: whether all counts have a dark reference, of their own exposure, without light.
 
     Args:
         session: its captures.
         source: where the white is.
+        spectra: mean counts of captures' dark references that were read before, by name.
 
     Raises:
         InputError: the session does not have that source of white.
@@ -75,8 +80,13 @@ def check_dark(session: Session, source: Literal["auto"] | WhiteSource = "auto")
         advice = f" or leave out with {leave_out(frames)}" if 0 < len(frames) < len(session.frames) else ""
         return Finding("dark", "red", f"{sentence}{advice}.", {"without": without})
     white = np.percentile(some_lines(white_cubes(session, found)[0]), 95.0, axis=(0, 1))
-    darks = {e.name: some_lines(e.dark).mean(axis=(0, 1)) for e in exposures if e.dark is not None}
-    lit = {name: light_over_white(dark, white) for name, dark in darks.items()}
+    with_data, lit = ~unlit_bands(white[None]), {}
+    for exposure in exposures:
+        assert exposure.dark is not None
+        dark = (spectra or {}).get(exposure.name)
+        if dark is None:
+            dark = some_lines(exposure.dark).mean(axis=(0, 1))
+        lit[exposure.name] = light_over_white(dark[with_data], white[with_data])
     values: dict[str, object] = {"light_over_white": {name: round(value, 5) for name, value in lit.items()}}
     shining = [name for name, value in lit.items() if value > LIT_AMBER]
     if shining:

@@ -154,13 +154,13 @@ def unlit_bands(light: Float[np.ndarray, "columns bands"]) -> Bool[np.ndarray, "
 def dark_columns(
     dark: Num[np.ndarray, "dark_lines dark_samples bands"] | None, samples: int, bands: int
 ) -> Float[np.ndarray, "columns bands"]:
-    """Counts without light of each sample: the mean over the dark cube's lines; 0 without a dark cube.
+    """Counts without light of each sample: the mean over the dark cube's lines with data; 0 without a dark cube.
 
     A dark cube of another width cannot be matched by sample and gives one spectrum (columns = 1).
     """
     if dark is None:
         return np.zeros((1, bands))
-    columns = dark.mean(axis=0, dtype=np.float64)
+    columns = fill_no_data(np.asarray(dark), None).mean(axis=0, dtype=np.float64)
     return columns if len(columns) == samples else columns.mean(axis=0, keepdims=True)
 
 
@@ -206,9 +206,17 @@ def some_lines(cube: Cube) -> Num[np.ndarray, "rows samples bands"]:
 def light_of_some_lines(cube: Cube, dark: Cube | None) -> Float[np.ndarray, "rows samples bands"]:
     """Counts above dark of ``SOME_LINES`` lines of a cube (`spread_rows`); 0 for no data."""
     counts = np.asarray(cube.memmap()[spread_rows(cube.shape[0], SOME_LINES)])
-    missing = no_data(counts, cube.ignore_value)
-    dark_lines = None if dark is None else dark.memmap()[:SOME_LINES]
-    light = counts.astype(np.float32) - dark_columns(dark_lines, *cube.shape[1:]).astype(np.float32)
+    return light_above(counts, None if dark is None else some_lines(dark), cube.ignore_value)
+
+
+def light_above(
+    counts: Num[np.ndarray, "lines samples bands"],
+    dark: Num[np.ndarray, "dark_lines dark_samples bands"] | None,
+    ignore_value: float | None,
+) -> Float[np.ndarray, "lines samples bands"]:
+    """Counts above dark; 0 for no data."""
+    missing = no_data(counts, ignore_value)
+    light = counts.astype(np.float32) - dark_columns(dark, *counts.shape[1:]).astype(np.float32)
     return light if missing is None else np.where(missing, np.float32(0.0), light)
 
 

@@ -5,13 +5,14 @@ Materials have none: a line that all pixels of the frames show over the white is
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import median_filter
 
-from hsi_sc_nerf.calibration.detector import light_of_some_lines, unlit_bands
+from hsi_sc_nerf.calibration.detector import light_of_some_lines
 from hsi_sc_nerf.calibration.white_source import WhiteSource, checked_source, white_cubes
 from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.findings import Finding, judged
@@ -20,15 +21,23 @@ LINE_AMBER, LINE_RED = 0.03, 0.1
 """Height of a line over the reflectance beside it, as a fraction. Good sessions have less than 0.005."""
 WINDOW_NM, LARGEST_STEP_NM, FEWEST_BANDS = 45.0, 6.0, 40
 """Span in which reflectance is compared, more than twice a line's width; and bands that tell of lines."""
-FRAMES, BRIGHT, PIXELS = 8, 0.3, 2000
-"""Frames, fraction of the brightest pixels' light from which pixels are compared, and so many of a frame."""
+LEAST_WHITE = 0.1
+"""Light on the white over that of its brightest band. In darker bands a spectrometer's stray light counts, which
+differs from material to material."""
+FRAMES, BRIGHT, PIXELS = 8, 0.3, 250
+"""Frames, fraction of the brightest pixels' light from which pixels are compared, and about so many of a frame."""
 
 
-def check_lines(session: Session, source: Literal["auto"] | WhiteSource = "auto") -> list[Finding]:
+def check_lines(
+    session: Session,
+    frames: Sequence[Float[np.ndarray, "pixels bands"]],
+    source: Literal["auto"] | WhiteSource = "auto",
+) -> list[Finding]:
     """The finding ``light-lines``, for sessions with narrow bands and a white of their own.
 
     Args:
         session: its captures.
+        frames: counts above dark of brighter pixels of each frame (`bright_pixels`).
         source: where the white is.
 
     Raises:
@@ -41,12 +50,11 @@ def check_lines(session: Session, source: Literal["auto"] | WhiteSource = "auto"
         return []
     cube, dark = white_cubes(session, found)
     white = bright_pixels(light_of_some_lines(cube, dark)).mean(axis=0)
-    lit = ~unlit_bands(white[None]) & cube.good_bands
+    lit = (white >= LEAST_WHITE * white.max()) & cube.good_bands
+    if np.count_nonzero(lit) < FEWEST_BANDS:
+        return []
     chosen = np.unique(np.linspace(0, len(session.frames) - 1, FRAMES).astype(int)).tolist()
-    spectra = [
-        bright_pixels(light_of_some_lines(frame.cube, frame.dark))[:, lit] / white[lit]
-        for frame in (session.frames[number] for number in chosen)
-    ]
+    spectra = [frames[number][:, lit] / white[lit] for number in chosen]
     window = 2 * round(WINDOW_NM / 2.0 / float(np.median(steps_nm))) + 1
     height = line_heights(np.concatenate(spectra), window)
     worst = int(np.abs(height).argmax())

@@ -17,6 +17,7 @@ from hsi_sc_nerf.calibration.white_reference import Roi, White, column_white, wh
 from hsi_sc_nerf.capture.envi import Cube
 from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.number_table import read_number_table
 
 WhiteSource = Literal["tarp", "capture", "target", "product"]
 LARGEST_FRACTION = 1.5
@@ -110,9 +111,8 @@ def read_panel(path: Path, wavelengths_nm: Float[np.ndarray, "bands"]) -> Float[
     """Reflectance of a panel at the band centres, by linear interpolation.
 
     Each line of the file has a wavelength in nm and a reflectance, in any order of wavelengths; reflectances are
-    percent if any is above 1.5. The separator is a comma, semicolon or tab; with the latter two, decimal commas are
-    read. A header line, empty lines and lines that begin with # are skipped. The panel may end one band short of the
-    bands; its outermost value is used there.
+    percent if any is above 1.5. A header line, empty lines and lines that begin with # are skipped
+    (`read_number_table`). The panel may end one band short of the bands; its outermost value is used there.
 
     Raises:
         InputError: there is no such file, a line is not two numbers, a value is out of range, a wavelength is given
@@ -141,21 +141,19 @@ def read_panel(path: Path, wavelengths_nm: Float[np.ndarray, "bands"]) -> Float[
 def _read(path: Path) -> tuple[Float[np.ndarray, "lines"], Float[np.ndarray, "lines"]]:
     """Wavelengths (nm) and reflectances (fractions) in the order of the file."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is no text"
-        raise InputError(f"{path}: the panel's reflectance cannot be read ({reason}); check the path.") from error
-    lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1)]
-    lines = [(number, line) for number, line in lines if line and not line.startswith("#")]
-    rows = [_numbers(line) for _, line in lines]
-    if rows and rows[0] is None:  # titles of the columns
-        rows, lines = rows[1:], lines[1:]
-    if not rows:
+        table = read_number_table(path)
+    except OSError as error:
+        raise InputError(
+            f"{path}: the panel's reflectance cannot be read ({error.strerror}); check the path."
+        ) from error
+    except ValueError as error:
+        raise InputError(f"{path}: the panel's reflectance cannot be read ({error}); write {_FORMAT}.") from error
+    if len(table.numbers) == 0:
         raise InputError(f"{path}: holds no reflectance; write {_FORMAT}.")
-    if None in rows:
-        number, line = lines[rows.index(None)]
-        raise InputError(f"{path}: line {number} ({line!r}) is not two numbers; write {_FORMAT}.")
-    panel_nm, reflectance = np.array(rows, dtype=float).T
+    whole = np.isfinite(table.numbers).all(axis=1) & (table.numbers.shape[1] == 2)
+    if not whole.all():
+        raise InputError(f"{path}: line {table.lines[int(whole.argmin())]} is not two numbers; write {_FORMAT}.")
+    panel_nm, reflectance = table.numbers.T
     if panel_nm.min() < SHORTEST_NM:
         raise InputError(f"{path}: gives {panel_nm.min():g} as a wavelength; write wavelengths in nm.")
     fractions = reflectance / 100.0 if reflectance.max() > LARGEST_FRACTION else reflectance
@@ -166,14 +164,3 @@ def _read(path: Path) -> tuple[Float[np.ndarray, "lines"], Float[np.ndarray, "li
             "more than nothing and at most about 1, or 100 percent; correct it."
         )
     return panel_nm, fractions
-
-
-def _numbers(line: str) -> tuple[float, float] | None:
-    """The two finite numbers of a line, or None."""
-    separator = next((mark for mark in ";\t" if mark in line), ",")
-    parts = line.split(separator)
-    try:
-        wavelength, reflectance = (float(part if separator == "," else part.replace(",", ".")) for part in parts)
-    except ValueError:
-        return None
-    return (wavelength, reflectance) if np.isfinite([wavelength, reflectance]).all() else None

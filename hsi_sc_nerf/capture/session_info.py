@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from hsi_sc_nerf.errors import InputError, shown
 from hsi_sc_nerf.files import read_json
+from hsi_sc_nerf.number_table import read_number_table
 from hsi_sc_nerf.settings_file import read_dataclass
 
 SESSION_INFO_NAME = "session.json"
@@ -105,14 +106,14 @@ def read_session_info(path: Path) -> SessionInfo:
 
 
 def read_band_centres(path: Path) -> Float[np.ndarray, "bands"]:
-    """Band centres in nm from the first column of a CSV with a header line.
+    """Band centres in nm from the first column of a CSV.
 
     Raises:
         InputError: the file cannot be read, or its numbers are no wavelengths in nm.
     """
     try:
-        lines = path.read_text(encoding="utf-8-sig").split("\n")[1:]
-        centres_nm = np.array([float(line.split(",")[0]) for line in lines if line.strip()])
+        numbers = read_number_table(path, columns=1).numbers
+        centres_nm = numbers[:, 0] if numbers.size else np.empty(0)
     except (OSError, ValueError) as error:
         raise InputError(
             f"{path}: is not a list of band centres ({error}); write a line of names and one wavelength in nm a line."

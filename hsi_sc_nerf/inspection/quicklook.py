@@ -13,12 +13,17 @@ from jaxtyping import Float, Num, UInt8
 from scipy.stats import median_abs_deviation
 
 from hsi_sc_nerf.calibration.detector import (
+    SOME_LINES,
     dark_columns,
+    fill_no_data,
+    light_above,
     light_of_some_lines,
     no_data,
     saturation_counts,
     some_lines,
+    spread_rows,
 )
+from hsi_sc_nerf.calibration.line_checks import bright_pixels
 from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.poses.session_pictures import edge_slope
 from hsi_sc_nerf.spectra import nearest_bands, to_8_bit
@@ -44,6 +49,8 @@ class Quicklook:
         dark_fraction: fraction of the readings that are no light, by band.
         sharpness_per_px: mean slope of the strongest edges over the picture's contrast.
         digest: hash of the readings; equal for copies only.
+        dark_spectrum: mean counts of the dark reference; None without one.
+        bright_spectra: counts above dark of some of the brighter pixels.
     """
 
     name: str
@@ -53,6 +60,8 @@ class Quicklook:
     dark_fraction: Float[np.ndarray, "bands"]
     sharpness_per_px: float
     digest: str
+    dark_spectrum: Float[np.ndarray, "bands"] | None
+    bright_spectra: Float[np.ndarray, "pixels bands"]
 
     @property
     def gray(self) -> UInt8[np.ndarray, "lines samples"]:
@@ -75,10 +84,11 @@ def quicklook_of(capture: Capture, white: Float[np.ndarray, "bands"]) -> Quicklo
         white: counts of a white above dark, of the same integration time.
     """
     cube = capture.cube
-    counts, read = cube.memmap(), some_lines(cube)
-    light, noise = light_of_some_lines(cube, capture.dark), np.zeros(cube.shape[2])
-    channels = nearest_bands(cube.wavelengths_nm, PICTURE_NM)
+    counts = cube.memmap()
+    lines = np.asarray(counts[spread_rows(cube.shape[0], SOME_LINES)])
     dark = None if capture.dark is None else some_lines(capture.dark)
+    read, light = fill_no_data(lines, cube.ignore_value), light_above(lines, dark, cube.ignore_value)
+    channels, noise = nearest_bands(cube.wavelengths_nm, PICTURE_NM), np.zeros(cube.shape[2])
     if dark is not None:
         noise = np.asarray(dark, np.float32).std(axis=0).mean(axis=0)
     level = dark_columns(dark, *cube.shape[1:]).mean(axis=0)
@@ -101,6 +111,8 @@ def quicklook_of(capture: Capture, white: Float[np.ndarray, "bands"]) -> Quicklo
         dark_fraction=(light <= DARK_SIGMAS * noise).mean(axis=(0, 1)),
         sharpness_per_px=sharpness_per_px(picture.mean(axis=-1)),
         digest=hashlib.sha256(np.ascontiguousarray(read).tobytes()).hexdigest(),
+        dark_spectrum=None if dark is None else dark.mean(axis=(0, 1)),
+        bright_spectra=bright_pixels(light),
     )
 
 

@@ -34,6 +34,7 @@ from hsi_sc_nerf.packed.dataset import (
 from hsi_sc_nerf.poses.pose_methods import PoseMethod, find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.processing.appearance_checks import check_appearance
+from hsi_sc_nerf.processing.band_order import check_band_order
 from hsi_sc_nerf.processing.chamber import background_spectrum
 from hsi_sc_nerf.processing.effects import draw_effects, measure_effects, points_of_object, show_effects
 from hsi_sc_nerf.processing.frames import (
@@ -166,12 +167,13 @@ def process_session(
     container = container_under(session, poses)
     masks, hull = _write_masks(caches, frames, poses, container, config.masks, output_dir, console, checks)
     object_box_m, scene_box_m = _boxes(session, hull, poses, container, console)
-    typical = None
+    wavelengths_nm = session.wavelengths_nm[calibration.bands]
+    spectrum, typical = _object_spectrum(frames, masks), None
+    checks.add(check_band_order(spectrum, wavelengths_nm))
     if calibration.uncertainty is not None:
-        typical = calibration.uncertainty.standard_deviation(_object_spectrum(frames, masks))
+        typical = calibration.uncertainty.standard_deviation(spectrum)
     write_calibration(output_dir / REPORT_NAME, session, calibration, pixel_counts, typical)
 
-    wavelengths_nm = session.wavelengths_nm[calibration.bands]
     widths_nm = session.frames[0].cube.fwhm_nm
     dataset = PackedDataset(
         root=output_dir,

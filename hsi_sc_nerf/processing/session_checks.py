@@ -18,10 +18,10 @@ CHECKS_PATH = Path("report") / INSPECTION_NAME
 """File in the dataset with the inspection's content and the findings of all later steps."""
 MAY_BE_RED = (
     *("angles", "binning", "copies", "damaged", "dates", "exposure", "mirrored", "other-object", "paper", "scale"),
-    *("turn", "white", "white-clipped", "dark", "light-lines", "clipped", "drift", "noise"),
+    *("turn", "veil", "white", "white-clipped", "dark", "light-lines", "clipped", "drift", "noise"),
     *("poses-angles", "poses-aspect", "poses-camera", "poses-direction", "poses-scale", "poses-uncertain"),
     *("frames-hull", "frames-light", "frames-slip"),
-    *("masks-border", "masks-cut", "masks-empty", "masks-hull", "masks-static"),
+    *("masks-border", "masks-cut", "masks-empty", "masks-hull", "masks-static", "band-order"),
 )
 """Checks whose findings may be red, in their order: of the session, the calibration, the poses and the masks."""
 

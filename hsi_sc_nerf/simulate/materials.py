@@ -8,7 +8,6 @@ overtone of water after Peñuelas et al. (1993).
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from jaxtyping import Float
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError, shown
+from hsi_sc_nerf.number_table import read_number_table
 from hsi_sc_nerf.settings_file import between, check_ranges, read_dataclass
 
 Spectrum = Float[np.ndarray, "bands"]
@@ -200,19 +200,18 @@ def read_spectrum(path: Path) -> Measured:
             not cover `paper.WAVELENGTH_RANGE_NM`; a reflectance is outside [0, 1].
     """
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = list(csv.DictReader(file, skipinitialspace=True))
-        wavelengths_nm, reflectance = (np.array([float(row[column]) for row in rows]) for column in COLUMNS)
+        columns = read_number_table(path).by_title()
+        wavelengths_nm, reflectance = (columns[name] for name in COLUMNS)
     except OSError as error:
         raise InputError(
             f"{path}: cannot be read ({error.strerror}); give the path of a spectrum's CSV file."
         ) from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError) as error:
         raise InputError(
             f"{path}: is not a table of numbers with the columns {' and '.join(COLUMNS)}; save it like that."
         ) from error
     low_nm, high_nm = paper.WAVELENGTH_RANGE_NM
-    if len(rows) == 0 or not wavelengths_nm.min() <= low_nm < high_nm <= wavelengths_nm.max():
+    if len(wavelengths_nm) == 0 or not wavelengths_nm.min() <= low_nm < high_nm <= wavelengths_nm.max():
         raise InputError(f"{path}: must cover {low_nm:g} to {high_nm:g} nm; extend the spectrum at its ends.")
     if not (np.diff(wavelengths_nm) > 0.0).all():
         raise InputError(f"{path}: wavelengths must increase from line to line; sort the lines and keep each once.")

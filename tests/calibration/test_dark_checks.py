@@ -5,7 +5,7 @@ import pytest
 from capture_factory import BANDS, DARK, LAMP, SIZE_PX, WAVELENGTHS_NM, write_session
 
 from hsi_sc_nerf.calibration.dark_checks import check_dark, light_over_white
-from hsi_sc_nerf.capture.envi import write_cube
+from hsi_sc_nerf.capture.envi import open_cube, write_cube
 from hsi_sc_nerf.capture.session import open_session
 
 
@@ -46,6 +46,21 @@ def test_a_dark_reference_with_light(folder, name, light, level):
     assert finding.level == level
     assert (name in finding.sentence) == (level != "green")
     assert finding.values["light_over_white"][name] == pytest.approx(light, rel=0.05, abs=0.001)
+
+
+def test_spectra_that_were_read_before_are_taken(folder):
+    opened = open_session(folder)
+    assert check_dark(opened, "auto", {"ball_2": DARK + 0.05 * LAMP, "ball_3": None}).level == "red"
+
+
+def test_bands_without_data_are_no_light(folder):
+    for header in folder.glob("*/capture/*.hdr"):
+        cube = open_cube(header)
+        counts = cube.read().astype(np.float32)
+        counts[..., -2:] = np.nan
+        counts[0, 0] = np.nan
+        write_cube(header, counts, wavelengths_nm=WAVELENGTHS_NM)
+    assert found(folder).level == "green"
 
 
 def test_all_darks_with_light_the_whites_own_too(folder):

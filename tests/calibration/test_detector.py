@@ -10,6 +10,7 @@ import pytest
 
 from hsi_sc_nerf.calibration.detector import (
     Readings,
+    dark_columns,
     elements_without_response,
     find_defects,
     pooled_darks,
@@ -254,3 +255,10 @@ def test_darks_whose_pattern_changes_are_kept():
     np.testing.assert_array_equal(pooled_darks(darks, 16, np.full(6, 4.0)), darks)
     single = [np.zeros((1, 6)), np.ones((1, 6))]
     np.testing.assert_array_equal(pooled_darks(single, 16, np.full(6, 4.0)), single)
+
+
+def test_dark_counts_without_data_are_left_out():
+    """One missing reading of an element does not take the element, and no band."""
+    dark = np.full((4, 3, 2), 100.0, np.float32)
+    dark[1, 2, 0] = np.nan
+    np.testing.assert_array_equal(dark_columns(dark, 3, 2), np.full((3, 2), 100.0))

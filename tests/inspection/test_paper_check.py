@@ -5,8 +5,9 @@ import re
 
 import numpy as np
 import pytest
-from inspection_session import INFO, SIZE_PX, WAVELENGTHS_NM, write_one
+from inspection_session import INFO, LAMP, SIZE_PX, WAVELENGTHS_NM, write_one
 
+from hsi_sc_nerf.capture.envi import open_cube, write_cube
 from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.inspection.inspect import inspect_session
 
@@ -54,6 +55,17 @@ def test_an_integration_time_that_is_not_as_stated(session, stated_ms, level):
     assert ("too low" in found.sentence) == (level != "green")
 
 
+@pytest.mark.parametrize(("veil", "level"), [(0.0, "green"), (0.1, "amber"), (0.2, "red")])
+def test_stray_light_over_all_frames(session, veil, level):
+    for frame in session.glob("fruit_*"):
+        cube = open_cube(frame / "capture" / f"{frame.name}.hdr")
+        counts = np.clip(cube.read() + np.rint(veil * LAMP), 0, 4095).astype(np.uint16)
+        write_cube(cube.header_path, counts, wavelengths_nm=WAVELENGTHS_NM)
+    (found,) = [f for f in inspect_session(open_session(session)).findings if f.name == "veil"]
+    assert found.level == level
+    assert found.values["value"] == pytest.approx((0.03 + veil) / (PAPER + veil), abs=0.05)
+
+
 def test_without_a_tarp_or_markers_nothing_is_said(session):
     (session / "session.json").write_text(json.dumps({**INFO, "marker_dictionary": "DICT_7X7_50"}))
-    assert [f for f in inspect_session(open_session(session)).findings if f.name == "paper"] == []
+    assert [f for f in inspect_session(open_session(session)).findings if f.name in ("paper", "veil")] == []

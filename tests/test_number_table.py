@@ -1,0 +1,93 @@
+"""Tables of numbers as programs in several languages export them."""
+
+import numpy as np
+import pytest
+
+from hsi_sc_nerf.analysis.calibrations import read_calibration
+from hsi_sc_nerf.analysis.library import read_library
+from hsi_sc_nerf.calibration.white_source import read_panel
+from hsi_sc_nerf.capture.session_info import read_band_centres
+from hsi_sc_nerf.number_table import number_in, numbers_in, read_number_table
+from hsi_sc_nerf.simulate.materials import read_spectrum
+
+NM, SLOPES = [450.0, 453.5, 457.0], [0.013, -0.021, np.nan]
+EXPORTS = {
+    "plain": "# unit: %\nwavelength_nm,coefficient\n450,0.013\n453.5,-0.021\n457,NA\n",
+    "German Excel": "# unit: %;\nwavelength_nm;coefficient\r\n450;0,013\r\n453,5;-0,021\r\n457;\r\n;\r\n",
+    "tabs": "# unit: %\nWavelength (nm)\tCoefficient\n4,5e2\t0,013\n453,5\t-0,021\n457\t\n",
+    "quoted titles": '"# unit: %",\n"Wavelength [nm]","Coefficient (-)"\n"450,0","0,013"\n"453,5","-0,021"\n457,\n',
+    "trailing separators": "# unit: %;;;\nWavelength/nm;Coefficient;;\n450;0.013;;\n453.5;-0.021;;\n457;;;\n;;;\n",
+    "micrometres": "# unit: %\nwavelength (µm);coefficient\n0,45;0,013\n0,4535;-0,021\n0,457;\n",
+    "minus sign": "# unit: %\nwavelength_nm;coefficient\n450;0,013\n453,5;\N{MINUS SIGN}0,021\n457;\n",
+}
+
+
+def write(folder, text, encoding="utf-8", name="own.csv"):
+    path = folder / name
+    path.write_bytes(text.encode(encoding))
+    return path
+
+
+@pytest.mark.parametrize("text", EXPORTS.values(), ids=EXPORTS)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
+def test_exports_hold_the_same_numbers(tmp_path, text, encoding):
+    if encoding == "cp1252":
+        text = text.replace("\N{MINUS SIGN}", "-")
+    path = write(tmp_path, text, encoding)
+    columns = read_number_table(path).by_title()
+    np.testing.assert_allclose(columns["wavelength_nm"], NM)
+    np.testing.assert_allclose(columns["coefficient"], SLOPES)
+    calibration = read_calibration(path)
+    assert calibration.unit == "%"
+    np.testing.assert_allclose(calibration.values(np.array([[0.5, 0.25, 9.0]])), [0.0065 - 0.00525])
+
+
+def test_heads_of_a_calibration_that_a_spreadsheet_saved(tmp_path):
+    """Commas may have become semicolons, a value a cell of its own."""
+    head = "# intercept:;14,2;;\n# preprocessing: absorbance; savgol 3 1 1\n"
+    limits = "# t2_limit: 5,5\n# score_variances: 0,5; 2\n"
+    titles = "wavelength_nm;coefficient;mean;weight_1;weight_2;loading_1;loading_2\n"
+    rows = "".join(f"{nm};0,5;0,1;1;0;1;0\n" for nm in (450, 460, 470))
+    calibration = read_calibration(write(tmp_path, head + limits + titles + rows))
+    assert [name for name, _ in calibration.steps] == ["absorbance", "savgol"]
+    assert calibration.predict(np.zeros((1, 3))).item() == 14.2
+    assert calibration.domain.t2_limit == 5.5
+    np.testing.assert_array_equal(calibration.domain.variances, [0.5, 2.0])
+
+
+def test_other_tables_of_the_same_exports(tmp_path):
+    text = '"Wellenlänge";"Schale; grün";Stiel\n450;0,1;0,4\n900;0,6;0,3\n'
+    library = read_library(write(tmp_path, text, "cp1252"))
+    assert library.names == ("Schale; grün", "Stiel")
+    np.testing.assert_allclose(library.spectra, [[0.1, 0.6], [0.4, 0.3]])
+    panel = read_panel(write(tmp_path, "nm\tR (%)\n400\t97,5\n1000\t98,5\n", "utf-16"), np.array([700.0]))
+    np.testing.assert_allclose(panel, [0.98])
+    for text in ("450,5;blau\n460;rot\n", "nm;Farbe\r\n450,5;blau\r\n460;rot\r\n", "450.5\n460\n"):
+        np.testing.assert_allclose(read_band_centres(write(tmp_path, text, "utf-8-sig")), [450.5, 460.0])
+    spectrum = read_spectrum(write(tmp_path, "Reflectance;Wavelength (nm)\n0,5;390\n0,6;1010\n"))
+    assert spectrum.reflectance == (0.5, 0.6)
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (b"nm,R\n400,0,9\n", "line 2 has 3 and not 2; between numbers with decimal commas"),
+        (b"nm;R\n400;1.234,5\n", r"line 2: '1\.234,5' is not a number"),
+        (b"nm;R\n400;1,234,5\n", "line 2: '1,234,5' is not a number"),
+        (b'nm,R\n400,"0.9\n', "quotation marks"),
+        (b"\xff\xfe\x00", "no text"),
+        (b"PK\x03\x04\0\0\0\n1,2\n", "no text"),
+    ],
+)
+def test_what_is_no_table_of_numbers(tmp_path, content, why):
+    path = tmp_path / "own.csv"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=why):
+        read_number_table(path)
+
+
+def test_lists_of_numbers():
+    assert numbers_in("0.5, 2,1e-3,") == [0.5, 2.0, 0.001]
+    assert numbers_in("0,5; 2") == [0.5, 2.0]
+    assert numbers_in("") == []
+    assert np.isnan(number_in(" NA "))
