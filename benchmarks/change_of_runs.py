@@ -3,7 +3,7 @@
     uv run python benchmarks/change_of_runs.py FOLDER
 
 Each fruit has four sessions: of the first day, of the same day set down anew twice, and of a day when its bruise has
-grown. They are simulated with a lamp at one side that grows weaker, photon and read noise, processed, trained by the
+grown. They are simulated in even light that grows weaker, with photon and read noise, processed, trained by the
 preset fast and exported by the commands that a user would type; what is there is not done again.
 """
 
@@ -36,7 +36,7 @@ from hsi_sc_nerf.simulate.truth import write_mesh
 BANDS, FRAMES, SIZE_PX, POINTS = 25, 36, 128, 200_000
 EVERY = 4
 """So many points for each one that is compared, to save time."""
-EFFECTS = ("photon_noise", "read_noise", "{lamp: {fraction: 0.3}}", "{lamp_drift: {percent: -3.0}}")
+EFFECTS = ("photon_noise", "read_noise", "{lamp_drift: {percent: -3.0}}")
 NM = np.linspace(400.0, 1000.0, BANDS)
 DAYS = {
     "first": SetDown(AGAIN),
