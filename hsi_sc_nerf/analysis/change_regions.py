@@ -10,7 +10,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from hsi_sc_nerf.analysis.change_significance import PATCH_M, Patches
+from hsi_sc_nerf.analysis.change_noise import PATCH_M
+from hsi_sc_nerf.analysis.change_significance import Patches
 from hsi_sc_nerf.geometry.mesh import Mesh
 
 OUTSIDE = -1
