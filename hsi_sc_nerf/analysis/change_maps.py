@@ -128,7 +128,7 @@ def changes(
         p = np.where(seen, test.p[patches.of_vertex], 1.0)
         beyond, significant = last - first - test.whole, test.p < FALSE_DISCOVERIES
         region, regions = changed_regions(
-            one.mesh, one.areas_m2, patches, beyond, significant, test.noise, smallest_m2
+            one.mesh, one.areas_m2, patches, first, beyond, significant, test.noise, smallest_m2
         )
         change = (last - first)[:, 0] if shown is None else np.where(seen, shown, np.nan)
         return Quantity(name, unit, change, p, test, region, regions)

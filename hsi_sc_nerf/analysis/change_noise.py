@@ -94,7 +94,7 @@ def _noise(
         noise = usual * np.exp(found[0] + harder @ found[1:])
     else:
         noise = np.full(len(harder), usual)
-    return noise * biweight_scale(change / np.hypot(noise[known], misplaced))
+    return np.maximum(noise * biweight_scale(change / np.hypot(noise[known], misplaced)), _ROUNDING)
 
 
 def biweight_scale(values: Float[np.ndarray, "n"]) -> float:

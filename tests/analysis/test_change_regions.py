@@ -32,7 +32,10 @@ def outlined(plane, change, noise=0.02, smallest_m2=5e-6):
     mesh, areas_m2 = plane
     patches = surface_patches(mesh.vertices, areas_m2, np.ones(len(areas_m2), bool))
     significant = np.linalg.norm(patches.means(change, areas_m2), axis=1) > 0.3
-    return changed_regions(mesh, areas_m2, patches, change, significant, np.full(change.shape[1], noise), smallest_m2)
+    before = np.zeros_like(change)
+    return changed_regions(
+        mesh, areas_m2, patches, before, change, significant, np.full(change.shape[1], noise), smallest_m2
+    )
 
 
 def test_a_blurred_disc_has_the_area_of_the_disc(plane):
