@@ -137,12 +137,11 @@ def _require_free(out: Path, rows: Sequence[Row]) -> None:
     except InputError:
         return  # damaged, and now written anew
     for row in rows:
-        before = earlier.get(row[OBJECT], row[SESSION])
-        # One that is no longer there was moved.
-        if before != row[SESSION] and Path(before).is_dir():
+        before, results = earlier.get(row[OBJECT], row[SESSION]), out / OBJECTS_NAME / row[OBJECT]
+        # A session that is no longer there was moved.
+        if before != row[SESSION] and Path(before).is_dir() and results.is_dir():
             raise InputError(
-                f"{out}: its object {row[OBJECT]} is of another session, {before}; choose another --output-dir, or "
-                f"delete {out / OBJECTS_NAME / row[OBJECT]} and {path} to replace it."
+                f"{results}: is of another session, {before}; choose another --output-dir, or delete it to replace it."
             )
 
 

@@ -37,13 +37,16 @@ def sessions(tmp_path):
 
 def test_results_of_another_session_are_not_replaced(sessions):
     out, monday, friday = sessions
+    (out / "objects" / "pear").mkdir(parents=True)
     before = (out / LIST_NAME).read_text()
-    with pytest.raises(InputError, match=r"object pear is of another session, .*monday; .* --output-dir"):
+    with pytest.raises(InputError, match=r"pear: is of another session, .*monday; .* --output-dir"):
         plan(out, apple=friday, pear=friday)
     assert (out / LIST_NAME).read_text() == before
     shutil.move(monday, friday / "moved")
     plan(out, pear=friday / "moved")
     assert "moved" in (out / LIST_NAME).read_text()
+    (out / "objects" / "pear").rmdir()
+    plan(out, pear=friday)
 
 
 def test_objects_that_the_list_does_not_name_are_told(sessions):
