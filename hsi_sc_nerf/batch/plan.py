@@ -141,7 +141,7 @@ def _require_free(out: Path, rows: Sequence[Row]) -> None:
         # A session that is no longer there was moved.
         if before != row[SESSION] and Path(before).is_dir() and results.is_dir():
             raise InputError(
-                f"{results}: is of another session, {before}; choose another --output-dir, or delete it to replace it."
+                f"{results}: is of another session, {before}; choose another --output-dir, or delete it first."
             )
 
 
