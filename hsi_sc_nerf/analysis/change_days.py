@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.analysis.change_features import surface_samples
@@ -33,12 +33,15 @@ class Day:
         name: of the day.
         surface: the first day's mesh with this day's spectra.
         raised_m: distance of this day's points from the mesh along its normals.
+        conditions: of the points around each vertex what makes their errors larger, the larger the worse: smallest
+            incidence angle, how few views see them, how far they lie from a plane; 0 where the cloud does not tell.
         attitude: how the object was set down relative to the first day; None on that.
     """
 
     name: str
     surface: SpectralMesh
     raised_m: Float[np.ndarray, "v"]
+    conditions: Float[np.ndarray, "v 3"]
     attitude: Attitude | None
 
 
@@ -90,24 +93,34 @@ def days_on_one_mesh(
                 raise InputError(f"{name} beside {names[0]}: {error}") from error
             moved = replace(cloud, points=attitude.transform(cloud.points))
         surface = with_spectra(mesh, moved, SEEN_WITHIN * config.smoothing_radius_m, max_incidence_deg)
-        raised_m, beyond_edge = _raised_m(moved.points, mesh.vertices, normals, config.smoothing_radius_m)
-        seen = surface.seen & ~beyond_edge
-        days.append(Day(name, replace(surface, seen=seen), np.where(seen, raised_m, np.nan), attitude))
+        distance_m, near = cKDTree(moved.points).query(mesh.vertices, k=min(NEIGHBOURS, len(moved.points)))
+        offset = moved.points[near].mean(axis=1) - mesh.vertices
+        raised_m = np.einsum("vj,vj->v", offset, normals)
+        seen = surface.seen & ~_beyond_edge(offset, raised_m, normals, distance_m[:, -1], config.smoothing_radius_m)
+        seen_raised_m = np.where(seen, raised_m, np.nan)
+        days.append(Day(name, replace(surface, seen=seen), seen_raised_m, _conditions(moved, near), attitude))
     return days
 
 
-def _raised_m(
-    points: Float[np.ndarray, "n 3"],
-    vertices_m: Float[np.ndarray, "v 3"],
+def _beyond_edge(
+    offset: Float[np.ndarray, "v 3"],
+    raised_m: Float[np.ndarray, "v"],
     normals: Float[np.ndarray, "v 3"],
+    furthest_m: Float[np.ndarray, "v"],
     detail_m: float,
-) -> tuple[Float[np.ndarray, "v"], Bool[np.ndarray, "v"]]:
-    """Height of the points near each vertex above it, and whether it lies beyond their edge.
+) -> Bool[np.ndarray, "v"]:
+    """Whether a vertex lies beyond the edge of a cloud, whose points near it have their mean at ``offset``.
 
-    Beyond the edge, the nearest points all lie on one side, and their spectra say nothing of the vertex.
+    There, the nearest points all lie on one side, and their spectra say nothing of the vertex.
     """
-    distance_m, near = cKDTree(points).query(vertices_m, k=min(NEIGHBOURS, len(points)))
-    offset = points[near].mean(axis=1) - vertices_m
-    raised_m = np.einsum("vj,vj->v", offset, normals)
     aside_m = np.linalg.norm(offset - raised_m[:, None] * normals, axis=1)
-    return raised_m, (aside_m > _ONE_SIDED * distance_m[:, -1]) & (aside_m > detail_m / 2.0)
+    return (aside_m > _ONE_SIDED * furthest_m) & (aside_m > detail_m / 2.0)
+
+
+def _conditions(cloud: SpectralCloud, near: Int[np.ndarray, "v k"]) -> Float[np.ndarray, "v 3"]:
+    none = np.zeros(len(cloud))
+    incidence, views = (cloud.extra.get(name, none)[near].mean(axis=1) for name in (INCIDENCE, "views"))
+    off = cloud.points[near] - cloud.points[near].mean(axis=1, keepdims=True)
+    # The smallest eigenvalue of the covariance is the variance across the plane that fits best.
+    across = np.linalg.eigvalsh(np.einsum("vki,vkj->vij", off, off))[:, 0]
+    return np.stack([incidence, -views, np.sqrt(np.maximum(across, 0.0))], axis=1)

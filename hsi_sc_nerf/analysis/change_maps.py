@@ -14,7 +14,6 @@ from hsi_sc_nerf.analysis.change_features import COMPONENTS, surface_gradients, 
 from hsi_sc_nerf.analysis.change_regions import OUTSIDE, ChangedRegion, changed_regions
 from hsi_sc_nerf.analysis.change_significance import (
     FALSE_DISCOVERIES,
-    Patches,
     Significance,
     significance,
     surface_patches,
@@ -30,8 +29,6 @@ MISPLACED_M = 0.0003
 RIM_M = 0.006
 """Patches this near to what is not seen lie at its rim: seen at grazing angles, beside what the object stands on."""
 _LEAST_PATCHES = 20
-_NOISE_RATIO = 3.0
-"""Stated noise further from the usual one than this is not believed."""
 
 
 @dataclass(frozen=True)
@@ -107,11 +104,10 @@ def changes(
                 f"{day.name} beside {before.name}: hardly any surface is seen in both; give clouds of one object."
             )
     misplaced_m = _misplaced_m(before, after, one.mesh.vertices)
-    noise = _relative_noise(before, after, patches)
     hidden = one.mesh.vertices[~np.all([day.surface.seen for day in days], axis=0)]
-    rim = np.zeros(len(patches.areas_m2), bool)
-    if len(hidden):
-        rim = cKDTree(hidden).query(patches.centres_m)[0] < RIM_M
+    to_rim_m = cKDTree(hidden).query(patches.centres_m)[0] if len(hidden) else np.full(len(patches.areas_m2), np.inf)
+    worst = patches.means(np.max([day.conditions for day in days], axis=0), one.areas_m2)
+    conditions = np.column_stack([worst, -to_rim_m])
     modes = session_sd * np.stack([np.ones(len(one.wavelengths_nm)), np.linspace(-1.0, 1.0, len(one.wavelengths_nm))])
     typical = np.median(one.spectra[seen], axis=0)[None]
 
@@ -128,11 +124,11 @@ def changes(
         slopes = np.linalg.norm(surface_gradients(patches.centres_m, patches.means(first, one.areas_m2)), axis=2)
         off = np.nan_to_num(slopes) * misplaced_m * (name != SURFACE)
         errors = of_repeat[0] if of_repeat else None
-        test = significance(of_patches, patches.centres_m, noise, off, shared, errors, rim)
+        test = significance(of_patches, patches.centres_m, off, shared, conditions, errors, to_rim_m < RIM_M)
         p = np.where(seen, test.p[patches.of_vertex], 1.0)
         beyond, significant = last - first - test.whole, test.p < FALSE_DISCOVERIES
         region, regions = changed_regions(
-            one.mesh, one.areas_m2, patches, beyond, significant, test.noise, smallest_m2
+            one.mesh, one.areas_m2, patches, first, beyond, significant, test.noise, smallest_m2
         )
         change = (last - first)[:, 0] if shown is None else np.where(seen, shown, np.nan)
         return Quantity(name, unit, change, p, test, region, regions)
@@ -214,15 +210,3 @@ def _misplaced_m(before: Day, after: Day, vertices_m: Float[np.ndarray, "v 3"]) 
         if attitude is not None:
             variance += radius_m**2 * (np.deg2rad(attitude.turn_sd_deg) ** 2 + attitude.growth_sd**2)
     return float(np.sqrt(variance))
-
-
-def _relative_noise(before: Day, after: Day, patches: Patches) -> Float[np.ndarray, "p"]:
-    """Scatter of the frames on each patch on both days, relative to the usual one; 1 where it is not stated."""
-    first, last = before.surface.scatter, after.surface.scatter
-    if first is None or last is None:
-        return np.ones(len(patches.areas_m2))
-    of_patches = patches.means(np.hypot(first, last)[:, None], before.surface.areas_m2)[:, 0]
-    if not np.isfinite(of_patches).any():
-        return np.ones(len(patches.areas_m2))
-    ratio = of_patches / max(float(np.nanmedian(of_patches)), 1e-12)
-    return np.clip(np.nan_to_num(ratio, nan=1.0), 1.0 / _NOISE_RATIO, _NOISE_RATIO)

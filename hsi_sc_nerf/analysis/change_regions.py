@@ -10,11 +10,15 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from hsi_sc_nerf.analysis.change_significance import PATCH_M, Patches
+from hsi_sc_nerf.analysis.change_noise import PATCH_M
+from hsi_sc_nerf.analysis.change_significance import Patches
 from hsi_sc_nerf.geometry.mesh import Mesh
 
 OUTSIDE = -1
 _PLATEAU_PERCENT = 90.0
+_MOST_CONTRAST = 1.25
+"""Of inside and outside, relative to the plateau of the change."""
+_ROUNDS = 10
 _GAP = 2.5
 """Distance, in patches, of the centres of two that belong together."""
 _REACH = 3.0
@@ -55,6 +59,7 @@ def changed_regions(
     mesh: Mesh,
     areas_m2: Float[np.ndarray, "v"],
     patches: Patches,
+    before: Float[np.ndarray, "v k"],
     change: Float[np.ndarray, "v k"],
     significant: Bool[np.ndarray, "p"],
     noise: Float[np.ndarray, "k"],
@@ -63,16 +68,22 @@ def changed_regions(
     """Outline the areas around significant patches, finer than patches are.
 
     Significant patches of one sign with gaps of at most one patch are one region, and so are those whose regions
-    overlap. A region's change is projected onto the direction of its mean, and its edge is where half of its plateau
-    (the 90th percentile) is reached: there, a blurred edge stays in place. What reaches that level beside the
-    significant patches and is connected to them belongs to it. The edges at one standard deviation of the noise more
-    and less give the standard deviation of the area.
+    overlap. A region's change is projected onto the direction of its mean, and its edge is where half of its height
+    is reached: there, a blurred edge stays in place. What reaches that level beside the significant patches and is
+    connected to them belongs to it. The edges at one standard deviation of the noise more and less give the standard
+    deviation of the area.
+
+    The height is the 90th percentile of the change or, where that is larger, by how much the values of both days
+    inside differ from those outside: on a narrow ring around a bruise, blurred edges leave no plateau, but the bruise
+    has one. Where the surface itself has other colours the latter may be too large, so that it is at most a quarter
+    more.
 
     Args:
         mesh: the surface.
         areas_m2: of the vertices.
         patches: of the vertices.
-        change: of each vertex, less that of the whole surface; NaN where it is not known.
+        before: values of each vertex on the first day.
+        change: of each vertex since then, less that of the whole surface; NaN where it is not known.
         significant: whether the change of each patch is.
         noise: standard deviations of a usual patch's changes.
         smallest_m2: regions below this area are left out.
@@ -92,7 +103,12 @@ def changed_regions(
         near = near[off_m < np.inf]
         along = np.full(len(core), -np.inf)
         along[near] = change[near] @ direction
-        half = np.percentile(along[core], _PLATEAU_PERCENT) / 2.0
+        plateau = float(np.percentile(along[core], _PLATEAU_PERCENT))
+        first = before[near] @ direction
+        contrast = _contrast(
+            np.concatenate([first, first + along[near]]), float(np.median(before[core] @ direction)), plateau
+        )
+        half = np.clip(contrast, plateau, _MOST_CONTRAST * plateau) / 2.0
         blur = float(np.linalg.norm(noise * direction))
         inside, less, more = (_connected(mesh, along > level, core) for level in (half, half + blur, half - blur))
         return inside, float(areas_m2[more].sum() - areas_m2[less].sum()) / 2.0
@@ -120,6 +136,20 @@ def changed_regions(
     order = np.full(len(found) + 1, OUTSIDE)
     order[kept] = np.arange(len(kept))
     return order[labels], [found[number][1] for number in kept]
+
+
+def _contrast(values: Float[np.ndarray, "n"], low: float, height: float) -> float:
+    """By how much the values in the higher one of two classes exceed those in the lower one, median less median.
+
+    The classes are parted half way between the two (Ridler and Calvard 1978), from a first guess on.
+    """
+    high = low + height
+    for _ in range(_ROUNDS):
+        above = values > (low + high) / 2.0
+        if above.all() or not above.any():
+            break
+        low, high = float(np.median(values[~above])), float(np.median(values[above]))
+    return high - low
 
 
 def grown_regions(

@@ -14,25 +14,19 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import stats
 from scipy.spatial import cKDTree
-from scipy.spatial.distance import cdist
 
-PATCH_M = 0.005
-"""Size of the patches that are tested; finer ones would test the noise of single points."""
+from hsi_sc_nerf.analysis.change_noise import PATCH_M, correlation, noise_of_patches
+
 FALSE_DISCOVERIES = 0.05
 """Expected fraction of the patches called changed that did not (Benjamini and Yekutieli 2001)."""
-_BIWEIGHT = 9.0
 _BIWEIGHT_EFFICIENCY = 0.87
 """Of the biweight scale with this constant, for normal errors: so much of the sample counts."""
-_CLIPPED = 3.0
-_ROUNDING = 1e-5
-"""In every unit that is compared: radians, reflectance, millimetres."""
 _NEAR_M = 0.015
 """Within this distance of a place, errors are of one size."""
 _LARGEST = 2.0
 """The largest of some ten normal errors, in standard deviations."""
-_BINS = 24
-_MOST_PATCHES = 1500
-"""Patches that the correlation is found from."""
+_OBSERVATIONS = 12.0
+"""The noise of a patch in its own conditions is known as from so many at most: from the few that are like it."""
 
 
 @dataclass(frozen=True)
@@ -103,18 +97,18 @@ def surface_patches(
 def significance(
     change: Float[np.ndarray, "p k"],
     centres_m: Float[np.ndarray, "p 3"],
-    relative_noise: Float[np.ndarray, "p"],
     misplaced: Float[np.ndarray, "p k"],
     session_sd: Float[np.ndarray, "k"],
+    conditions: Float[np.ndarray, "p c"] | None = None,
     repeat: Float[np.ndarray, "p k"] | None = None,
     rim: Bool[np.ndarray, "p"] | None = None,
 ) -> Significance:
     """Test each patch's change against the errors that the changes of all patches show.
 
     The change of a patch is k numbers, such as principal components of its spectrum. Beyond the whole surface's, it
-    has the variance ``noise² (1 + relative_noise²) / 2 + misplaced²``, whose ``noise`` is the biweight scale of all
-    patches; patches that changed hardly count in it while they are fewer than half. T², the sum of the k squared
-    ratios, is compared with Hotelling's distribution for as many observations as there are independent parts.
+    has the variance ``noise² + misplaced²``, with the noise of patches under such conditions
+    (`hsi_sc_nerf.analysis.change_noise.noise_of_patches`). T², the sum of the k squared ratios, is compared with
+    Hotelling's distribution for as many observations as there are independent parts, or like patches.
 
     The changes ``repeat`` between two captures of one day are errors alone. No noise is less than theirs: neither
     that of all patches, nor half of the largest error around a patch (for one at the rim of what is seen, anywhere at
@@ -124,9 +118,9 @@ def significance(
     Args:
         change: after less before, NaN where it is not known.
         centres_m: of the patches.
-        relative_noise: stated noise of each patch relative to that of the usual one.
         misplaced: change of each patch that an error of the registration would make.
         session_sd: standard deviation of errors that a whole session shares.
+        conditions: what makes the errors of a patch larger, each column the larger the harder; none by default.
         repeat: change of each patch from the first day to another capture of it, NaN where it is not known.
         rim: which patches lie at the rim of what is seen; none by default.
 
@@ -134,44 +128,43 @@ def significance(
         >>> centres_m = np.random.default_rng(0).random((400, 3))
         >>> change = np.random.default_rng(1).normal(size=(400, 1))
         >>> change[0] = 30.0
-        >>> found = significance(change, centres_m, np.ones(400), np.zeros((400, 1)), np.zeros(1))
+        >>> found = significance(change, centres_m, np.zeros((400, 1)), np.zeros(1))
         >>> np.flatnonzero(found.p < FALSE_DISCOVERIES)
         array([0])
     """
     known = np.isfinite(change).all(axis=1)
-    used, dimensions = change[known], change.shape[1]
-    spread = np.sqrt((1.0 + np.square(relative_noise[known, None])) / 2.0)
+    used, off, at_m, dimensions = change[known], misplaced[known], centres_m[known], change.shape[1]
+    hard = np.zeros((len(change), 0))[known] if conditions is None else conditions[known]
     whole = np.median(used, axis=0)
     beyond = used - whole
-    noise = _noise(beyond, spread)
+    noise = noise_of_patches(beyond, hard, off, at_m)
+    sd = np.hypot(noise, off)
     if repeat is None:
-        sd = np.hypot(noise * spread, misplaced[known])
-        length_m, independent = correlation(beyond / sd, centres_m[known])
+        length_m, independent = correlation(beyond / sd, at_m)
         squares = np.square(beyond / sd).sum(axis=1)
     else:
         both = np.isfinite(repeat[known]).all(axis=1)
         shared = np.median(repeat[known][both], axis=0)
         errors = repeat[known] - shared
-        noise = np.maximum(noise, _noise(errors[both], spread[both]))
+        noise = np.maximum(noise, noise_of_patches(errors, hard, off, at_m))
         session_sd = np.maximum(session_sd, np.abs(shared))
-        sd = np.hypot(noise * spread, misplaced[known])
+        sd = np.hypot(noise, off)
         at_rim = np.zeros(len(used), bool) if rim is None else rim[known]
-        sd *= np.maximum(_largest_around(errors / sd, centres_m[known], both, at_rim) / _LARGEST, 1.0)
-        found = correlation(beyond / sd, centres_m[known]), correlation((errors / sd)[both], centres_m[known][both])
+        sd *= np.maximum(_largest_around(errors / sd, at_m, both, at_rim) / _LARGEST, 1.0)
+        found = correlation(beyond / sd, at_m), correlation((errors / sd)[both], at_m[both])
         length_m, independent = max(one for one, _ in found), min(one for _, one in found)
         in_itself = np.square(used / np.hypot(sd, session_sd)).sum(axis=1)
         squares = np.minimum(np.square(beyond / sd).sum(axis=1), in_itself)
-    observations = max(independent * _BIWEIGHT_EFFICIENCY, dimensions + 2.0)
+    of_all = independent * _BIWEIGHT_EFFICIENCY
+    of_like = min(of_all, _OBSERVATIONS) if hard.shape[1] else of_all
     p = np.ones(len(change))
-    p[known] = stats.false_discovery_control(hotelling_p(squares, dimensions, observations), method="by")
+    of_patches = hotelling_p(squares, dimensions, max(of_like, dimensions + 2.0))
+    p[known] = stats.false_discovery_control(of_patches, method="by")
     # The median of normal errors has pi / 2 times the variance of the mean.
-    whole_sd = np.sqrt(np.pi / 2.0 * np.square(noise) / independent + np.square(session_sd))
-    whole_p = hotelling_p(np.square(whole / whole_sd).sum(), dimensions, observations)
-    return Significance(p, noise, length_m, independent, whole, whole_sd, float(whole_p))
-
-
-def _noise(beyond: Float[np.ndarray, "n k"], spread: Float[np.ndarray, "n 1"]) -> Float[np.ndarray, "k"]:
-    return np.array([biweight_scale(column) for column in (beyond / spread).T])
+    usual = np.median(noise, axis=0)
+    whole_sd = np.sqrt(np.pi / 2.0 * np.square(usual) / independent + np.square(session_sd))
+    whole_p = hotelling_p(np.square(whole / whole_sd).sum(), dimensions, max(of_all, dimensions + 2.0))
+    return Significance(p, usual, length_m, independent, whole, whole_sd, float(whole_p))
 
 
 def _largest_around(
@@ -186,46 +179,6 @@ def _largest_around(
     largest = np.stack([size[near].max(axis=0) for near in around])
     largest[rim] = np.maximum(largest[rim], size[rim].max(axis=0, initial=0.0))
     return largest
-
-
-def biweight_scale(values: Float[np.ndarray, "n"]) -> float:
-    """Tukey's biweight midvariance as a standard deviation (Mosteller and Tukey 1977): outliers do not count.
-
-    At least what rounding in files of single precision makes, which is no change.
-    """
-    off = values - np.median(values)
-    within = 1.0 - np.square(off / max(_BIWEIGHT * np.median(np.abs(off)), 1e-12))
-    kept = within > 0.0
-    off, within = off[kept], within[kept]
-    weight = np.sum(within * (5.0 * within - 4.0))
-    variance = len(off) * np.sum(np.square(off) * within**4) / max(weight, 1e-12) ** 2
-    return float(max(np.sqrt(variance), _ROUNDING))
-
-
-def correlation(ratio: Float[np.ndarray, "n k"], centres_m: Float[np.ndarray, "n 3"]) -> tuple[float, float]:
-    """Length over which changes of patches, in standard deviations, are alike, and how many are independent.
-
-    The mean product of pairs over their distance falls to 1 / e at that length. For errors that decay exponentially
-    the variance of a mean over n patches is that of ``n² / sum exp(-distance / length)`` independent ones.
-    """
-    if len(ratio) > _MOST_PATCHES:
-        chosen = np.random.default_rng(0).choice(len(ratio), _MOST_PATCHES, replace=False)
-        ratio, centres_m = ratio[chosen], centres_m[chosen]
-    clipped = np.clip(ratio, -_CLIPPED, _CLIPPED)
-    clipped = clipped - clipped.mean(axis=0)
-    distance_m = cdist(centres_m, centres_m)
-    product = clipped @ clipped.T / max(np.square(clipped).sum() / len(clipped), 1e-12)
-    edges = np.arange(_BINS + 1) * PATCH_M + PATCH_M / 2.0
-    each = np.digitize(distance_m.ravel(), edges)
-    count = np.bincount(each, minlength=_BINS + 2)
-    mean = np.bincount(each, product.ravel(), _BINS + 2) / np.maximum(count, 1)
-    # Bin 0 holds each patch with itself; bin b the pairs about b patches apart.
-    at, value = np.arange(_BINS + 1) * PATCH_M, np.concatenate([[1.0], mean[1 : _BINS + 1]])
-    below = np.flatnonzero((value < np.exp(-1.0)) & (count[: _BINS + 1] > 0))
-    last = int(below[0]) if len(below) else _BINS
-    high, low = value[last - 1], min(value[last], np.exp(-1.0))
-    length_m = float(at[last - 1] + PATCH_M * (high - np.exp(-1.0)) / max(high - low, 1e-12))
-    return length_m, float(len(ratio) ** 2 / np.exp(-distance_m / max(length_m, 1e-9)).sum())
 
 
 def hotelling_p(squares: Float[np.ndarray, "*n"], dimensions: int, observations: float) -> Float[np.ndarray, "*n"]:

@@ -17,7 +17,7 @@ from PIL import Image
 from hsi_sc_nerf.batch import columns
 from hsi_sc_nerf.batch.columns import Column
 from hsi_sc_nerf.batch.plan import OBJECTS_NAME
-from hsi_sc_nerf.batch.session_list import OBJECT, SESSION
+from hsi_sc_nerf.batch.session_list import OBJECT, SESSION, SETTINGS
 from hsi_sc_nerf.batch.tables import Table
 from hsi_sc_nerf.files import atomic_write, read_picture
 from hsi_sc_nerf.inspection.inspect import THUMBNAIL_GAMMA
@@ -31,7 +31,7 @@ _SCRIPTS = ("statistics.js", "table.js", "charts.js", "overview.js")
 # Columns of the table at first; the others can be switched on.
 _SHOWN = {columns.FLAGS, columns.TOTAL, columns.SCORES["sam"]}
 _SHOWN |= {columns.SIZE[key][0] for key in ("volume_l", "area_m2", "height_m")}
-_HIDDEN_OF_LIST = {OBJECT, SESSION, "process", "train", "preset"}
+_HIDDEN_OF_LIST = {OBJECT, SESSION, *SETTINGS}
 # What the page shows in a way of its own, and the trait that its charts begin with.
 _SPECIAL = {
     "status": columns.STATUS,

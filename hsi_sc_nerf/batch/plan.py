@@ -11,7 +11,7 @@ from hsi_sc_nerf.batch.session_list import OBJECT, SESSION, Row, read_sessions, 
 from hsi_sc_nerf.batch.session_steps import SessionSettings, Step, is_up_to_date, session_steps
 from hsi_sc_nerf.benchmark.configurations import split_words
 from hsi_sc_nerf.errors import InputError, shown
-from hsi_sc_nerf.files import atomic_write, read_json, write_json
+from hsi_sc_nerf.files import atomic_write, make_folder, read_json, write_json
 from hsi_sc_nerf.findings import INSPECTION_NAME
 from hsi_sc_nerf.models.presets import Preset
 
@@ -52,16 +52,20 @@ def write_plan(out: Path, rows: Sequence[Row], settings: SessionSettings) -> Non
     """Keep what is to be done in ``out``, where `read_plan` finds it; what is unchanged is not written anew.
 
     Raises:
-        InputError: words of a row cannot be used.
+        InputError: words of a row cannot be used, or ``out`` holds other sessions under the names of these, lies in
+            one of them, or has a list that no batch wrote.
     """
     for row in rows:
         _settings_of(row, settings)
+    _require_free(out, rows)
+    make_folder(out)
+    # The settings first: a list without them is not of a batch.
+    write_json(out / SETTINGS_NAME, asdict(settings))
     table = sessions_table(rows)
     path = out / LIST_NAME
     if not path.is_file() or path.read_text(encoding="utf-8") != table:
         with atomic_write(path) as (temporary,):
             temporary.write_text(table, encoding="utf-8")
-    write_json(out / SETTINGS_NAME, asdict(settings))
 
 
 def read_plan(out: Path) -> dict[str, PlannedObject]:
@@ -109,6 +113,36 @@ def outdated(objects: Mapping[str, PlannedObject], retry: bool) -> list[Path]:
             if status == "failed" and (retry or not step.was_tried(one.folder)):
                 found.append(one.record(name))
     return found
+
+
+def unlisted(out: Path, rows: Sequence[Row]) -> list[str]:
+    """Names of objects whose results lie in ``out``, but that the list does not name; the table leaves them out."""
+    folder = out / OBJECTS_NAME
+    listed = {row[OBJECT] for row in rows}
+    return sorted(one.name for one in folder.iterdir() if one.name not in listed) if folder.is_dir() else []
+
+
+def _require_free(out: Path, rows: Sequence[Row]) -> None:
+    """Check that nothing of the user's is replaced in ``out``."""
+    for row in rows:
+        if out.resolve().is_relative_to(row[SESSION]):
+            raise InputError(f"{out}: lies in the session {row[SESSION]}; choose another --output-dir.")
+    path = out / LIST_NAME
+    if not path.is_file():
+        return
+    if not (out / SETTINGS_NAME).is_file():
+        raise InputError(f"{path}: is not of a batch and would be replaced; move it, or choose another --output-dir.")
+    try:
+        earlier = {row[OBJECT]: row[SESSION] for row in read_sessions(path, may_be_gone=True)}
+    except InputError:
+        return  # damaged, and now written anew
+    for row in rows:
+        before, results = earlier.get(row[OBJECT], row[SESSION]), out / OBJECTS_NAME / row[OBJECT]
+        # A session that is no longer there was moved.
+        if before != row[SESSION] and Path(before).is_dir() and results.is_dir():
+            raise InputError(
+                f"{results}: is of another session, {before}; choose another --output-dir, or delete it first."
+            )
 
 
 def _check_types(settings: SessionSettings) -> None:

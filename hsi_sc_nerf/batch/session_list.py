@@ -11,6 +11,8 @@ from pathlib import Path
 from hsi_sc_nerf.errors import InputError, shown
 
 OBJECT, SESSION = "object", "session"
+SETTINGS = ("preset", "process", "train")
+"""Columns of a session's own settings."""
 _NAME = re.compile(r"[^\W_][\w.-]*")
 _NAME_RULE = "a name is of letters, digits, dots, dashes and underscores and begins with a letter or a digit"
 Row = dict[str, str]
@@ -27,7 +29,8 @@ def read_sessions(path: Path, may_be_gone: bool = False) -> list[Row]:
         may_be_gone: whether folders of sessions may be missing by now.
 
     Raises:
-        InputError: a column or a folder is missing, a name is no folder's or comes twice, or it is no table.
+        InputError: a column or a folder is missing, a name is no folder's or comes twice, a session comes twice with
+            the same settings, or it is no table.
 
     Example:
         >>> rows = read_sessions(Path("season.csv"))
@@ -47,6 +50,7 @@ def read_sessions(path: Path, may_be_gone: bool = False) -> list[Row]:
         if not rows:
             raise InputError(f"{path}: lists no sessions; write a line for each below its titles.")
     names: set[str] = set()
+    settings: dict[tuple[str, ...], str] = {}
     for where, row in rows:
         name = row[OBJECT]
         if not _NAME.fullmatch(name) or len(name) > 100:
@@ -62,8 +66,17 @@ def read_sessions(path: Path, may_be_gone: bool = False) -> list[Row]:
             there, row[SESSION] = folder.is_dir(), str(folder.resolve())
         except (OSError, ValueError) as error:  # a name that is too long, or that no system takes
             raise InputError(f"{where}: {shown(row[SESSION])} is no path ({error}); mend it.") from error
-        if not (may_be_gone or there):
+        if may_be_gone:
+            continue
+        if not there:
             raise InputError(f"{where}: there is no folder {folder}; mend the path or leave out the line.")
+        same = (row[SESSION], *(row.get(title, "") for title in SETTINGS))
+        if same in settings:
+            raise InputError(
+                f"{where}: its session is also that of {settings[same]}, with the same settings; mend the path or "
+                "leave out the line."
+            )
+        settings[same] = name
     return [row for _, row in rows]
 
 

@@ -13,11 +13,11 @@ from rich.console import Console
 from rich.markup import escape
 
 from hsi_sc_nerf import batch
-from hsi_sc_nerf.batch.plan import STEPS, outdated, read_plan, write_plan
+from hsi_sc_nerf.batch.plan import STEPS, outdated, read_plan, unlisted, write_plan
 from hsi_sc_nerf.batch.session_list import read_sessions
 from hsi_sc_nerf.batch.session_steps import SessionSettings
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import make_folder, read_json
+from hsi_sc_nerf.files import read_json
 from hsi_sc_nerf.settings_file import check_options
 
 SNAKEFILE = Path(batch.__file__).with_name("Snakefile")
@@ -54,7 +54,7 @@ class BatchCommand(SessionSettings):
         """Start the workflow.
 
         Raises:
-            InputError: the list of sessions cannot be used, another batch works in the folder, or a job was lost.
+            InputError: the list or the folder cannot be used, another batch works there, or a job was lost.
         """
         check_options(self)
         if self.snakefile:
@@ -72,9 +72,14 @@ class BatchCommand(SessionSettings):
                 f"{out}: another batch works there, or was killed; if none runs on any machine, start this one once "
                 "with --unlock, and again."
             )
-        make_folder(out)
         settings = SessionSettings(**{name: getattr(self, name) for name in SessionSettings.__dataclass_fields__})
         write_plan(out, rows, settings)
+        if left := unlisted(out, rows):
+            told = ", ".join(left[:5]) + (", …" if len(left) > 5 else "")
+            Console(stderr=True, highlight=False, soft_wrap=True).print(
+                f"[yellow]{escape(str(out))}: holds results that the list does not name ({escape(told)}); they stay, "
+                "and the table leaves them out."
+            )
         again = [str(path.relative_to(out.resolve())) for path in outdated(read_plan(out), self.retry)]
         words = ["--config", f"gpu={self.gpu}", "--keep-going", "--rerun-incomplete"]
         words += ["--rerun-triggers", "mtime", "input"]

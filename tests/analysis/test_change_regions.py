@@ -28,11 +28,14 @@ def disc(plane, x_m, radius_m):
     return smoothstep((radius_m - off_m) / 0.004 + 0.5)
 
 
-def outlined(plane, change, noise=0.02, smallest_m2=5e-6):
+def outlined(plane, change, noise=0.02, smallest_m2=5e-6, before=None):
     mesh, areas_m2 = plane
     patches = surface_patches(mesh.vertices, areas_m2, np.ones(len(areas_m2), bool))
     significant = np.linalg.norm(patches.means(change, areas_m2), axis=1) > 0.3
-    return changed_regions(mesh, areas_m2, patches, change, significant, np.full(change.shape[1], noise), smallest_m2)
+    before = np.zeros_like(change) if before is None else before
+    return changed_regions(
+        mesh, areas_m2, patches, before, change, significant, np.full(change.shape[1], noise), smallest_m2
+    )
 
 
 def test_a_blurred_disc_has_the_area_of_the_disc(plane):
@@ -49,6 +52,24 @@ def test_growth_by_a_ring_is_the_rings_area_in_any_direction_of_change(plane, di
     ring = disc(plane, 0.03, 0.013) - disc(plane, 0.03, 0.009)
     _, (region,) = outlined(plane, ring[:, None] * direction)
     assert region.area_m2 == pytest.approx(np.pi * (0.013**2 - 0.009**2), rel=0.06)
+
+
+@pytest.mark.parametrize("direction", [[1.0], [-1.0], [0.6, 0.8, 0.0]])
+def test_a_ring_that_is_as_narrow_as_its_edges_has_the_area_between_both_days_edges(plane, direction):
+    """Its change has no plateau; what it is to reach is seen inside, where nothing changed."""
+    before, after = (disc(plane, 0.03, radius_m)[:, None] * direction for radius_m in (0.009, 0.0116))
+    _, (region,) = outlined(plane, after - before, before=before)
+    true_m2 = np.pi * (0.0116**2 - 0.009**2)
+    assert region.area_m2 == pytest.approx(true_m2, rel=0.06)
+    _, (of_change_alone,) = outlined(plane, after - before)
+    assert of_change_alone.area_m2 > 1.1 * true_m2
+
+
+def test_other_colours_of_the_surface_do_not_move_the_edge_far(plane):
+    """One side is brighter by three times what changed."""
+    bright = 3.0 * (plane[0].vertices[:, :1] > 0.03)
+    _, (region,) = outlined(plane, disc(plane, 0.03, 0.01)[:, None], before=bright)
+    assert region.area_m2 == pytest.approx(np.pi * 0.01**2, rel=0.1)
 
 
 def test_what_rose_and_what_fell_are_two_regions_and_small_ones_are_left_out(plane):

@@ -2,12 +2,13 @@
 
 import json
 from functools import partial
+from pathlib import Path
 
 import pytest
 from quick_steps import quick_run
 
 from hsi_sc_nerf.batch.plan import INSPECTION_NAME, STEPS, outdated, read_plan, write_plan
-from hsi_sc_nerf.batch.recorded_step import record_step
+from hsi_sc_nerf.batch.recorded_step import copy_record, record_step
 from hsi_sc_nerf.batch.session_steps import SessionSettings
 from hsi_sc_nerf.cli import sessions
 from hsi_sc_nerf.errors import InputError
@@ -159,3 +160,27 @@ def test_what_is_red_is_left_to_process_which_may_accept_it(planned, opened):
     assert (record["status"], record["sentence"]) == ("done" if opened else "failed", "no markers are seen.")
     do(one, ["process"])
     assert json.loads(one.record("process").read_text())["status"] == "done"
+
+
+def test_a_pod_copies_the_record_to_where_snakemake_looks_for_it(planned, tmp_path):
+    """On Kubernetes: into a folder that is not there yet, or over the record of an earlier attempt."""
+    one, copy = planned()["pear"], tmp_path / "pod" / "fs" / "steps" / "inspect.json"
+    do(one, ["inspect"])
+    for _ in range(2):
+        copy_record(one, "inspect", copy)
+        assert copy.read_bytes() == one.record("inspect").read_bytes()
+        copy.write_text("an earlier attempt")
+
+
+@pytest.mark.parametrize("same", ["relative", "absolute", "link"])
+def test_a_record_that_is_in_its_place_is_left_as_it_is(planned, tmp_path, same):
+    """Copied onto itself, it would be an error, or empty."""
+    one = planned()["pear"]
+    do(one, ["inspect"])
+    before = one.record("inspect").read_bytes(), one.record("inspect").stat().st_mtime_ns
+    (tmp_path / "mounted").symlink_to(tmp_path, target_is_directory=True)
+    own = Path("objects/pear/steps/inspect.json")
+    copy_record(
+        one, "inspect", {"relative": own, "absolute": tmp_path / own, "link": tmp_path / "mounted" / own}[same]
+    )
+    assert (one.record("inspect").read_bytes(), one.record("inspect").stat().st_mtime_ns) == before

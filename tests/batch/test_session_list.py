@@ -58,6 +58,7 @@ def test_tables_of_spreadsheets_are_read(table, content):
         ("object,session\n" + "p" * 101 + ",a\n", "cannot be the name"),
         ("object,session\np,\n", "line 2: names no session"),
         ("object,session\np,nowhere\n", "line 2: there is no folder .*nowhere"),
+        ("object,session\np,a\nq,./a/\n", "line 3: its session is also that of p, with the same settings"),
         ("object,session\np,b, c\n", "line 2: has 3 cells and not 2"),
         ('object,session\np,"a\n', "is no table after line 2"),
         ("object,session\nÄ,a\n".encode("latin-1"), "is no UTF-8"),
@@ -68,6 +69,18 @@ def test_a_table_that_cannot_be_used_is_one_sentence(table, content, told):
     with pytest.raises(InputError, match=told) as raised:
         read_sessions(table(content))
     assert "\n" not in str(raised.value)
+
+
+def test_tables_of_other_languages_are_read(table, tmp_path):
+    """Umlauts, spaces, and a day that is no date, which is the user's own."""
+    (tmp_path / "Äpfel, grün").mkdir()
+    row, _ = read_sessions(table('object;session;day;Sorte\r\nÄpfel_1;"Äpfel, grün";31.02.;Boskop\r\np;a;;\r\n'))
+    assert row == {"object": "Äpfel_1", "session": str(tmp_path / "Äpfel, grün"), "day": "31.02.", "Sorte": "Boskop"}
+
+
+def test_a_session_may_come_twice_with_other_settings(table):
+    rows = read_sessions(table("object,session,preset\np,a,fast\nq,a,best\n"))
+    assert [row["preset"] for row in rows] == ["fast", "best"]
 
 
 def test_a_folder_of_sessions_is_a_list(table, tmp_path):
