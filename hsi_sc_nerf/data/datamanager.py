@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,9 +17,11 @@ from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 
 from hsi_sc_nerf.data.dataparser import SpectralDataParserConfig
 from hsi_sc_nerf.data.device_pixels import CameraRays, DevicePixels, fits_on_gpu
+from hsi_sc_nerf.errors import one_sentence
 from hsi_sc_nerf.packed.cube import unpack, unpack_unflagged
-from hsi_sc_nerf.packed.dataset import PackedFrame
+from hsi_sc_nerf.packed.dataset import PackedFrame, require_sizes
 from hsi_sc_nerf.packed.pixels import PixelReader, PixelSampler
+from hsi_sc_nerf.settings_file import between, check_options
 
 FROM_CHECKPOINT = "from_checkpoint"
 """Metadata of the training frames: whether a checkpoint replaces what a model finds in them before training."""
@@ -30,9 +33,9 @@ class SpectralDataManagerConfig(VanillaDataManagerConfig):
 
     _target: type = field(default_factory=lambda: SpectralDataManager)
     dataparser: SpectralDataParserConfig = field(default_factory=SpectralDataParserConfig)
-    train_num_rays_per_batch: int = 2048
+    train_num_rays_per_batch: int = between(1, math.inf, default=2048)
     """Rays of a training step."""
-    eval_num_rays_per_batch: int = 2048
+    eval_num_rays_per_batch: int = between(1, math.inf, default=2048)
     """Rays of an evaluation step during training."""
     seed: int = 0
     """Seed of the random pixels."""
@@ -50,6 +53,10 @@ class SpectralDataManagerConfig(VanillaDataManagerConfig):
     eval_num_images_to_sample_from: tyro.conf.Suppress[int] = -1
     eval_num_times_to_repeat_images: tyro.conf.Suppress[int] = -1
     eval_image_indices: tyro.conf.Suppress[tuple[int, ...] | None] = (0,)
+
+    def __post_init__(self) -> None:
+        with one_sentence():
+            check_options(self)
 
 
 class SpectralDataset(InputDataset):
@@ -141,6 +148,7 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
         return self._with_rays(self.eval_pixel_sampler.sample(step), self._eval_rays)
 
     def _pixel_sampler(self, dataset: SpectralDataset, num_rays: int) -> PixelSampler:
+        require_sizes(dataset.metadata["dataset"], dataset.frames)
         return PixelSampler(
             PixelReader(frame.cube() for frame in dataset.frames),
             np.stack([frame.mask() for frame in dataset.frames]),

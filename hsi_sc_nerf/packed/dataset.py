@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
@@ -29,6 +30,7 @@ _FRAME_FILES = {
 }
 _AGAIN = "process the session again"
 _MAY_BE_UNKNOWN = ("fwhm_nm", "typical_uncertainty")
+_ROTATION_TOLERANCE = 1e-3  # of digits that somebody rounded
 
 
 @dataclass(frozen=True)
@@ -190,6 +192,23 @@ def open_packed(path: Path) -> PackedDataset:
     return dataset
 
 
+def require_sizes(dataset: PackedDataset, frames: Iterable[PackedFrame]) -> None:
+    """Refuse frames whose cubes or masks have not the size that ``transforms.json`` states.
+
+    Raises:
+        InputError: one has another size, or cannot be read.
+    """
+    stated = (dataset.intrinsics.h, dataset.intrinsics.w, len(dataset.wavelengths_nm))
+    for frame in frames:
+        for path, shape in ((frame.cube_path, frame.cube().shape), (frame.mask_path, frame.mask().shape)):
+            if shape != stated[: len(shape)]:
+                found, expected = (" x ".join(map(str, size)) for size in (shape, stated))
+                raise InputError(
+                    f"{path}: has {found} values, but the dataset's transforms.json states {expected} (lines, "
+                    f"samples, bands); {_AGAIN}."
+                )
+
+
 def write_transforms(dataset: PackedDataset) -> Path:
     """Write ``transforms.json`` into the dataset's folder and return its path.
 
@@ -264,6 +283,9 @@ def _parse_transforms(root: Path, content: dict[str, Any], source: str) -> Packe
         raise ValueError("its pictures have no size or no focal length")
     bands = len(content["wavelengths_nm"])
     arrays: dict[str, Any] = {key: _numbers(content, key, shape) for key, shape in _shapes(bands).items()}
+    for key in ("scene_box_m", "object_box_m"):
+        if not (arrays[key][0] < arrays[key][1]).all():
+            raise ValueError(f"{key} has no volume")
     terms: dict[str, Any] = {}
     if uncertainty is not None:
         terms = {field.name: _numbers(uncertainty, field.name, (bands,)) for field in fields(ReflectanceUncertainty)}
@@ -295,6 +317,9 @@ def _parse_effect(content: dict[str, Any]) -> Effect:
 def _parse_frame(root: Path, frame: dict[str, Any]) -> PackedFrame:
     error_px, pose = frame["reprojection_error_px"], _numbers(frame, "transform_matrix", (4, 4))
     assert pose is not None
+    rotation = pose[:3, :3]
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0.0:
+        raise ValueError("a transform_matrix holds no rotation")
     capture, files = frame["capture"], {name: PurePosixPath(frame[key]) for name, key in _FRAME_FILES.items()}
     # A dataset may come from somebody else: what it names lies inside of it, as do files that are named after it.
     if any(file.is_absolute() or ".." in file.parts for file in files.values()):

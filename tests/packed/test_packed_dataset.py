@@ -23,7 +23,14 @@ from hsi_sc_nerf.packed.cube import (
     unpack,
     write_packed_cube,
 )
-from hsi_sc_nerf.packed.dataset import Container, PackedDataset, is_packed, open_packed, write_transforms
+from hsi_sc_nerf.packed.dataset import (
+    Container,
+    PackedDataset,
+    is_packed,
+    open_packed,
+    require_sizes,
+    write_transforms,
+)
 
 WAVELENGTHS_NM = np.array([450.5, 550.25, 650.125])
 
@@ -196,6 +203,10 @@ def test_is_packed(tmp_path, dataset):
         (lambda c: c["frames"][0].update(capture="../../a"), "capture is none of a file"),
         (lambda c: c.update(frames={"a": 1}), "cannot be read"),
         (lambda c: c.update(wavelengths_nm=3), "cannot be read"),
+        (lambda c: c.update(scene_box_m=[[1, 1, 1], [0, 0, 0]]), "scene_box_m has no volume"),
+        (lambda c: c["object_box_m"].__setitem__(1, c["object_box_m"][0]), "object_box_m has no volume"),
+        (lambda c: c["frames"][1].update(transform_matrix=[[0.0] * 4] * 4), "holds no rotation"),
+        (lambda c: c["frames"][0]["transform_matrix"][0].__setitem__(0, 9.0), "holds no rotation"),
     ],
 )
 def test_transforms_that_cannot_be_used(dataset, change, message):
@@ -203,6 +214,34 @@ def test_transforms_that_cannot_be_used(dataset, change, message):
     edit(dataset.root, change)
     with pytest.raises(InputError, match=rf"transforms\.json: .*{message}"):
         open_packed(dataset.root)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [lambda c: c.update(w=c["w"] + 1), lambda c: c.update(wavelengths_nm=c["wavelengths_nm"][:-1])],
+)
+def test_cubes_of_another_size_are_refused(dataset, change):
+    fewer = {"background_reflectance", "fwhm_nm", "typical_uncertainty"}
+
+    def shortened(content):
+        change(content)
+        bands = len(content["wavelengths_nm"])
+        content.update({key: content[key] and content[key][:bands] for key in fewer})
+        if content["uncertainty"]:
+            content["uncertainty"] = {key: terms[:bands] for key, terms in content["uncertainty"].items()}
+
+    write_transforms(dataset)
+    require_sizes(dataset, dataset.frames)
+    edit(dataset.root, shortened)
+    changed = open_packed(dataset.root)
+    with pytest.raises(InputError, match=r"\.hdr: has .* but the dataset"):
+        require_sizes(changed, changed.frames)
+
+
+def test_a_mask_of_another_size_is_refused(dataset):
+    write_png(dataset.frames[1].mask_path, np.zeros((2, 3), np.uint8))
+    with pytest.raises(InputError, match=r"masks.*png: has 2 x 3 values"):
+        require_sizes(dataset, dataset.frames)
 
 
 def test_missing_files(tmp_path, dataset):
