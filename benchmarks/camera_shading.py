@@ -13,7 +13,6 @@ runs on a checkout of it as well (``PYTHONPATH`` of that checkout, ``--model "vi
 from __future__ import annotations
 
 import json
-import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,9 +20,10 @@ import numpy as np
 import torch
 import tyro
 from accuracy_and_time import surface_figures
+from effects import held_out_views
 from matplotlib import rc_context
 from paper_tables import PaperTable, mean_and_deviation
-from results_table import write_results
+from results_table import current_commit, write_results
 
 import hsi_sc_nerf
 from hsi_sc_nerf.benchmark.configurations import own_configuration
@@ -32,7 +32,6 @@ from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.plotting import STYLE, new_figure, save_figure, show_image
 from hsi_sc_nerf.processing.process import process_session
-from hsi_sc_nerf.simulate.truth import load_truth
 
 NOISE = ("photon_noise", "read_noise")
 SCENES = {
@@ -105,7 +104,7 @@ class CameraShadingTable(PaperTable):
             mean_and_deviation([one[figure] for one in found], digits) if figure in found[0] else ""
             for figure, digits in DIGITS.items()
         ]
-        seeds, commit = " ".join(map(str, self.seeds)), commit_of_the_package()
+        seeds, commit = " ".join(map(str, self.seeds)), current_commit(Path(hsi_sc_nerf.__file__).parent)
         rows = [[name, self.model, *cells]]
         write_results("camera_shading", COLUMNS, rows, keys=2, seed=seeds, commit=commit, folder=self.results)
 
@@ -133,27 +132,13 @@ def held_out_errors(config: Path, session: Path | None, kept_view: Path) -> dict
         session: simulated; None for views as measured.
         kept_view: file that keeps the first view in three bands, for the picture.
     """
-    from nerfstudio.utils.eval_utils import eval_setup
-
-    _, pipeline, _, _ = eval_setup(config, test_mode="test")
-    pipeline.eval()
-    manager = pipeline.datamanager
-    frames = manager.eval_dataset.metadata["frames"]
-    truth = None if session is None else load_truth(session)
     found = []
-    for camera, batch in manager.fixed_indices_eval_dataloader:
-        with torch.no_grad():
-            rendered = pipeline.model.get_outputs_for_camera(camera)["spectral"].cpu()
-        expected = batch["spectral"]
-        if truth is not None:
-            expected = torch.from_numpy(truth.light(frames[batch["image_idx"]].capture).radiance()).to(rendered)
-        mask = batch["mask"][..., 0].bool()
-        rim = mask & torch.from_numpy(dilate(~mask.numpy(), 2 * RIM_PX + 1))
-        metrics = spectral_metrics(rendered, expected, mask)
+    for rendered, expected, mask, bands in held_out_views(config, session):
         if not found:
-            bands = pipeline.model.rgb_bands
             shown = {"rendered": rendered[..., bands], "expected": expected[..., bands], "mask": mask}
             np.savez(kept_view, **{key: value.numpy() for key, value in shown.items()})
+        rim = mask & torch.from_numpy(dilate(~mask.numpy(), 2 * RIM_PX + 1))
+        metrics = spectral_metrics(rendered, expected, mask)
         outermost = (rendered - expected)[rim].square().mean().sqrt()
         found.append({"sam": metrics["sam"], "rmse": metrics["rmse"], "rim": float(outermost)})
     return {name: float(np.mean([view[name] for view in found])) for name in found[0]}
@@ -184,13 +169,6 @@ def draw_views(path: Path, folder: Path) -> None:
         rows[0, 1 + 2 * i].set_title("by the " + model.split(" in ")[0])
         rows[0, 2 + 2 * i].set_title(f"error, -{SHOWN_ERROR:g} to {SHOWN_ERROR:g}")
     save_figure(figure, path)
-
-
-def commit_of_the_package() -> str:
-    """Commit of the package that is measured, which may be another checkout than the benchmark's."""
-    folder = Path(hsi_sc_nerf.__file__).parent
-    found = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=folder, capture_output=True, text=True)
-    return found.stdout.strip() or "unknown"
 
 
 if __name__ == "__main__":

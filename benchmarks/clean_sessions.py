@@ -8,14 +8,13 @@ and its dark, which is inspected only. Thresholds of the checks were chosen on o
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
 from results_table import RESULTS, write_results
-from session_mistakes import run_command
+from session_mistakes import findings_of_level, run_command
 
 from hsi_sc_nerf.capture.envi import open_cube, write_cube
 
@@ -79,13 +78,7 @@ class CleanSessions:
             shutil.rmtree(data)
             processed, _, _ = run_command(["process", str(session), "--output-dir", str(data)])
             found = Path("report") / found
-        findings = (
-            json.loads((data / found).read_text(encoding="utf-8"))["findings"] if (data / found).is_file() else []
-        )
-        told = [
-            ", ".join(dict.fromkeys(one["name"] for one in findings if one["level"] == level))
-            for level in ("red", "amber")
-        ]
+        told = [findings_of_level(data / found, level) for level in ("red", "amber")]
         row = [name, effects, str(inspected), str(processed), *told]
         write_results("clean_sessions", COLUMNS, [row], keys=1, folder=self.results)
 

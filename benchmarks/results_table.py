@@ -73,9 +73,8 @@ def read_results(path: Path) -> list[list[str]]:
         return list(csv.reader(file))
 
 
-def current_commit() -> str:
-    """Short name of the commit that is checked out, with ``+`` where files differ from it."""
-    folder = Path(__file__).parent
+def current_commit(folder: Path = Path(__file__).parent) -> str:
+    """Short name of the commit that is checked out at a folder, with ``+`` where files differ from it."""
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=folder, capture_output=True, text=True)
     changed = subprocess.run(["git", "status", "--porcelain", "-uno"], cwd=folder, capture_output=True, text=True)
     return (commit.stdout.strip() or "unknown") + ("+" if changed.stdout.strip() else "")

@@ -108,8 +108,7 @@ class SessionMistakes:
         mistake.make(made, session, other)
         inspected, _, inspect_s = run_command(["inspect", str(made), "--output-dir", str(data / "report")])
         found = data / "report" / "inspection.json"
-        findings = json.loads(found.read_text(encoding="utf-8"))["findings"] if found.is_file() else []
-        red = ", ".join(dict.fromkeys(finding["name"] for finding in findings if finding["level"] == "red"))
+        red = findings_of_level(found, "red")
         shutil.rmtree(data, ignore_errors=True)
         processed, said, process_s = run_command(["process", str(made), "--output-dir", str(data), *mistake.words])
         replaced = [frame.name for frame in replaced_frames(session)] if mistake.replaces_frames else []
@@ -117,15 +116,15 @@ class SessionMistakes:
         sentence = said.replace(str(made), "SESSION")
         if len(sentence) > LONGEST_SENTENCE:
             sentence = f"{sentence[:LONGEST_SENTENCE]} ..."
-        said = _amber(data) if processed == 0 else sentence
+        amber = findings_of_level(found, "amber")
+        said = sentence if processed != 0 else f"amber: {amber}" if amber else ""
         return [str(inspected), red, f"{inspect_s:.0f}", str(processed), said, *errors, f"{process_s:.0f}"]
 
 
-def _amber(data: Path) -> str:
-    """The names of the amber findings of a dataset."""
-    found = json.loads((data / "report" / "inspection.json").read_text(encoding="utf-8"))["findings"]
-    names = dict.fromkeys(one["name"] for one in found if one["level"] == "amber")
-    return f"amber: {', '.join(names)}" if names else ""
+def findings_of_level(inspection: Path, level: str) -> str:
+    """The names of the findings of a level, each once, in the file of an inspection; none without the file."""
+    found = json.loads(inspection.read_text(encoding="utf-8"))["findings"] if inspection.is_file() else []
+    return ", ".join(dict.fromkeys(one["name"] for one in found if one["level"] == level))
 
 
 def measured_errors(data: Path, session: Path, left_out: Sequence[str] = ()) -> list[str]:

@@ -28,11 +28,10 @@ from hsi_sc_nerf.benchmark.configurations import (
 )
 from hsi_sc_nerf.benchmark.run import BenchmarkRun, Checkpoint, Job
 from hsi_sc_nerf.benchmark.steps import available_cores, describe_machine, run_step
-from hsi_sc_nerf.capture.session import is_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import TEMPORARY_PREFIX, content_of, make_folder, read_json, write_json
 from hsi_sc_nerf.models.schedule import Clock
-from hsi_sc_nerf.packed.dataset import TRANSFORMS_NAME, open_packed, transforms_path
+from hsi_sc_nerf.packed.dataset import TRANSFORMS_NAME, open_packed
 from hsi_sc_nerf.settings_file import between, check_options
 
 
@@ -154,10 +153,10 @@ def _check(configurations: Sequence[Configuration], command: BenchmarkCommand) -
 
 def _packed(data: Path) -> Path:
     """The packed dataset that training will read; a session is processed as ``ns-train`` would."""
-    from hsi_sc_nerf.data.dataparser import processed_dir
+    from hsi_sc_nerf.data.dataparser import is_unprocessed, processed_dir
     from hsi_sc_nerf.processing.process import process_session
 
-    if is_session(data) and not transforms_path(data).is_file():
+    if is_unprocessed(data):
         data = process_session(data, processed_dir(data.resolve()))
     return open_packed(data).root.resolve()
 

@@ -19,7 +19,7 @@ from hsi_sc_nerf.data.dataparser import SpectralDataParserConfig
 from hsi_sc_nerf.data.device_pixels import CameraRays, DevicePixels, fits_on_gpu
 from hsi_sc_nerf.errors import one_sentence
 from hsi_sc_nerf.packed.cube import unpack, unpack_unflagged
-from hsi_sc_nerf.packed.dataset import PackedFrame, require_sizes
+from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
 from hsi_sc_nerf.packed.pixels import PixelReader, PixelSampler
 from hsi_sc_nerf.settings_file import between, check_options
 
@@ -148,10 +148,10 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
         return self._with_rays(self.eval_pixel_sampler.sample(step), self._eval_rays)
 
     def _pixel_sampler(self, dataset: SpectralDataset, num_rays: int) -> PixelSampler:
-        require_sizes(dataset.metadata["dataset"], dataset.frames)
+        packed: PackedDataset = dataset.metadata["dataset"]
         return PixelSampler(
-            PixelReader(frame.cube() for frame in dataset.frames),
-            np.stack([frame.mask() for frame in dataset.frames]),
+            PixelReader(packed.cube_of(frame) for frame in dataset.frames),
+            np.stack([packed.mask_of(frame) for frame in dataset.frames]),
             num_rays_per_batch=num_rays,
             seed=self.config.seed,
             has_flagged=dataset.has_flagged,

@@ -66,7 +66,7 @@ class SpectralDataParser(DataParser):
 
     def _open(self) -> PackedDataset:
         data = self.config.data
-        if is_session(data) and not transforms_path(data).is_file():
+        if is_unprocessed(data):
             return open_packed(process_session(data, processed_dir(data.resolve()), self.config.process))
         return open_packed(data)
 
@@ -152,8 +152,13 @@ def require_data(manager: Any) -> None:
         InputError: they are neither, or a dataset that cannot be read.
     """
     data = manager.data or manager.dataparser.data
-    if not is_session(data) or transforms_path(data).is_file():
+    if not is_unprocessed(data):
         open_packed(data)
+
+
+def is_unprocessed(data: Path) -> bool:
+    """Whether ``--data`` is a session; a dataset holds cubes as well, and is none even if it is damaged."""
+    return is_session(data) and not transforms_path(data).is_file()
 
 
 def processed_dir(session_dir: Path) -> Path:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8, UInt16
@@ -30,6 +29,7 @@ _FRAME_FILES = {
 }
 _AGAIN = "process the session again"
 _MAY_BE_UNKNOWN = ("fwhm_nm", "typical_uncertainty")
+_Array = TypeVar("_Array", bound=np.ndarray)
 _ROTATION_TOLERANCE = 1e-3  # of digits that somebody rounded
 
 
@@ -142,6 +142,32 @@ class PackedDataset:
     fingerprint: str | None = None
     effects: tuple[Effect, ...] = ()
 
+    def cube_of(self, frame: PackedFrame) -> UInt16[np.memmap, "lines samples bands"]:
+        """`PackedFrame.cube`, of the size that ``transforms.json`` states.
+
+        Raises:
+            InputError: the file is no packed cube, or of another size.
+        """
+        return self._of_stated_size(frame.cube_path, frame.cube())
+
+    def mask_of(self, frame: PackedFrame) -> Bool[np.ndarray, "lines samples"]:
+        """`PackedFrame.mask`, of the size that ``transforms.json`` states.
+
+        Raises:
+            InputError: the file is no picture, or of another size.
+        """
+        return self._of_stated_size(frame.mask_path, frame.mask())
+
+    def _of_stated_size(self, path: Path, values: _Array) -> _Array:
+        stated = (self.intrinsics.h, self.intrinsics.w, len(self.wavelengths_nm))
+        if values.shape != stated[: values.ndim]:
+            found, expected = (" x ".join(map(str, size)) for size in (values.shape, stated))
+            raise InputError(
+                f"{path}: has {found} values, but the dataset's transforms.json states {expected} (lines, samples, "
+                f"bands); {_AGAIN}."
+            )
+        return values
+
     @property
     def camera_to_worlds(self) -> Float[np.ndarray, "frames 4 4"]:
         """All poses, in frame order."""
@@ -190,23 +216,6 @@ def open_packed(path: Path) -> PackedDataset:
             if not os.path.isfile(file):
                 raise InputError(f"{file}: is missing, but {path} lists it; process the session again.")
     return dataset
-
-
-def require_sizes(dataset: PackedDataset, frames: Iterable[PackedFrame]) -> None:
-    """Refuse frames whose cubes or masks have not the size that ``transforms.json`` states.
-
-    Raises:
-        InputError: one has another size, or cannot be read.
-    """
-    stated = (dataset.intrinsics.h, dataset.intrinsics.w, len(dataset.wavelengths_nm))
-    for frame in frames:
-        for path, shape in ((frame.cube_path, frame.cube().shape), (frame.mask_path, frame.mask().shape)):
-            if shape != stated[: len(shape)]:
-                found, expected = (" x ".join(map(str, size)) for size in (shape, stated))
-                raise InputError(
-                    f"{path}: has {found} values, but the dataset's transforms.json states {expected} (lines, "
-                    f"samples, bands); {_AGAIN}."
-                )
 
 
 def write_transforms(dataset: PackedDataset) -> Path:

@@ -28,7 +28,6 @@ from hsi_sc_nerf.packed.dataset import (
     PackedDataset,
     is_packed,
     open_packed,
-    require_sizes,
     write_transforms,
 )
 
@@ -231,17 +230,17 @@ def test_cubes_of_another_size_are_refused(dataset, change):
             content["uncertainty"] = {key: terms[:bands] for key, terms in content["uncertainty"].items()}
 
     write_transforms(dataset)
-    require_sizes(dataset, dataset.frames)
+    assert dataset.cube_of(dataset.frames[0]).shape == (4, 5, 3)
     edit(dataset.root, shortened)
     changed = open_packed(dataset.root)
     with pytest.raises(InputError, match=r"\.hdr: has .* but the dataset"):
-        require_sizes(changed, changed.frames)
+        changed.cube_of(changed.frames[0])
 
 
 def test_a_mask_of_another_size_is_refused(dataset):
     write_png(dataset.frames[1].mask_path, np.zeros((2, 3), np.uint8))
     with pytest.raises(InputError, match=r"masks.*png: has 2 x 3 values"):
-        require_sizes(dataset, dataset.frames)
+        dataset.mask_of(dataset.frames[1])
 
 
 def test_missing_files(tmp_path, dataset):
