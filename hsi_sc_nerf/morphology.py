@@ -36,9 +36,17 @@ def touching(
 
 def largest_component(mask: Bool[np.ndarray, "lines samples"]) -> Bool[np.ndarray, "lines samples"]:
     """The largest 8-connected component; an empty mask stays empty."""
+    return (components(mask) or [np.zeros_like(mask)])[0]
+
+
+def components(
+    mask: Bool[np.ndarray, "lines samples"], least: float = 1.0
+) -> list[Bool[np.ndarray, "lines samples"]]:
+    """The 8-connected components, the largest first, whose area is at least ``least`` times the largest's."""
     _, labels, statistics, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     areas = statistics[1:, cv2.CC_STAT_AREA]
-    return labels == 1 + np.argmax(areas) if len(areas) else np.zeros_like(mask)
+    order = np.argsort(-areas, kind="stable")
+    return [labels == 1 + label for label in order if areas[label] >= least * areas[order[0]]]
 
 
 def fill_holes(mask: Bool[np.ndarray, "lines samples"]) -> Bool[np.ndarray, "lines samples"]:

@@ -28,6 +28,7 @@ from hsi_sc_nerf.analysis.size import (
     sizes_to_find,
 )
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, with_spectra
+from hsi_sc_nerf.analysis.standing_pieces import one_piece
 from hsi_sc_nerf.analysis.traits import RegionOfInterest, Traits, analyse, classified
 from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, SpectralCloud
 from hsi_sc_nerf.indices.catalogue import find_indices
@@ -82,6 +83,7 @@ def measure_traits(
     indices: Sequence[str] = (),
     calibrations: Sequence[Path | str | Calibration] = (),
     components: int = 0,
+    piece: int | None = None,
 ) -> Measurement:
     """Measure an object's size, and the spectra, indices and classes on its surface, as `hsi-sc-nerf traits` does.
 
@@ -99,9 +101,10 @@ def measure_traits(
         indices: names of the catalogue, or formulas as ``"CRI = 1/R510 - 1/R550"``.
         calibrations: tables (`read_calibration`), or what was read of them.
         components: principal components and endmembers to look for, at most.
+        piece: which of several objects that stand on the table, from 1; None where there is but one.
 
     Raises:
-        InputError: a file or a number cannot be used.
+        InputError: a file or a number cannot be used, or the cloud holds several objects and none is chosen.
 
     Example:
         >>> found = measure_traits(read_spectral_ply("point_cloud.ply"), indices=["PRI"], splits=0)
@@ -111,6 +114,7 @@ def measure_traits(
     config = MeshConfig() if mesh is None else mesh
     if config.base_height_m is None and dataset is not None and dataset.container is not None:
         config = replace(config, base_height_m=dataset.container.height_m)
+    cloud = one_piece(cloud, piece, config)
     picked = [RegionOfInterest(name, (x, y, z), radius) for name, (x, y, z, radius) in (regions or {}).items()]
     found_indices = find_indices(indices, cloud.wavelengths_nm)
     read = [one if isinstance(one, Calibration) else read_calibration(one) for one in calibrations]

@@ -114,6 +114,8 @@ class TraitsCommand:
     (docs/how-to/calibrations.md): a table (CSV) of coefficients, or one that names an ONNX model. May be repeated."""
     components: int = between(0, math.inf, default=0)
     """Look for so many principal components and endmembers, or as many as the noise supports if that is fewer."""
+    piece: int | None = None
+    """Where several objects stand on the table (process --masks.pieces), the one to measure: 1 is the largest."""
 
     def main(self) -> None:
         """Measure and write.
@@ -150,6 +152,7 @@ class TraitsCommand:
             indices=self.index,
             calibrations=self.calibration,
             components=self.components,
+            piece=self.piece,
         )
         console = Console(stderr=True)
         with console.status("tables and pictures"):

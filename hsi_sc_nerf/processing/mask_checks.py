@@ -29,6 +29,8 @@ STILL_OVERLAP = 0.97
 """Intersection over union of all masks from which they stand still."""
 STILL_FRACTION = 0.7
 """Fraction of the masks' edge that must not change for it to be the background's."""
+PIECES_FRACTION = 0.25
+"""Fraction of the frames that show a piece beside the masked ones, from which it is no passing spot."""
 STANDING_FRACTION = 0.5
 """Fraction of the middle of the lid that what stands on it hides."""
 
@@ -38,6 +40,7 @@ def check_masks(
     names: Sequence[str],
     silhouettes: Bool[np.ndarray, "frames h w"],
     brightness: Float[np.ndarray, "frames h w"],
+    left_out: Bool[np.ndarray, "frames"],
     regions: Bool[np.ndarray, "frames h w"] | None = None,
     lid_middles: Bool[np.ndarray, "frames h w"] | None = None,
 ) -> list[Finding]:
@@ -45,6 +48,7 @@ def check_masks(
 
     Args:
         silhouettes: of the masks' visual hull (`VotedHull`).
+        left_out: frames with a piece that its mask leaves out (`masks.foreground_masks`).
         regions: pixels that may be the object's (`masks.above_lid`), if the container is known.
         lid_middles: pixels that see the middle of the lid (`masks.lid_middle`), if the container is known.
 
@@ -63,6 +67,13 @@ def check_masks(
         found.append(Finding("masks-empty", level, sentence, {"frames": without}))
     if empty.all():
         return found
+    if left_out.mean() > PIECES_FRACTION:
+        sentence = (
+            f"{left_out.sum()} of {len(masks)} frames show something else beside the object, apart from it, which "
+            "the masks leave out; look at report/masks.png: take it away or, if it is part of the object, count the "
+            "object's pieces by --masks.pieces."
+        )
+        found.append(Finding("masks-pieces", "amber", sentence, {"frames": int(left_out.sum())}))
     return [
         *found,
         *_border(masks[~empty], None if regions is None else regions[~empty]),

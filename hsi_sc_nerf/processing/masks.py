@@ -22,7 +22,7 @@ from scipy.stats import median_abs_deviation
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_png
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, image_of, pixel_rays
-from hsi_sc_nerf.morphology import dilate, draw_outline, ellipse_close_open, fill_holes, largest_component, touching
+from hsi_sc_nerf.morphology import components, dilate, draw_outline, ellipse_close_open, fill_holes, touching
 from hsi_sc_nerf.packed.dataset import Container
 from hsi_sc_nerf.processing.foreground_score import background_subspace, foreground_score, otsu_threshold
 
@@ -32,6 +32,8 @@ MIN_SEPARATION = 6.0
 """Smallest such difference as a multiple of the background's scatter; noise alone has 3 to 5."""
 LID_MIDDLE = 0.3
 """Radius of the middle of the container's lid, of the lid's."""
+LEAST_PIECE = 0.1
+"""Smallest area of a separate piece of the object, of the largest piece's; what is smaller is noise."""
 CLOSING_FRACTION = 0.01
 """Diameter of the ellipse that closes gaps, as a fraction of the image's shorter side (3 pixels at least)."""
 
@@ -64,41 +66,49 @@ class MaskConfig:
     than this fraction of the object's; None for none. Not applied next to what is darker still."""
     overhang: float = 1.2
     """The object may reach beyond the container's lid up to this multiple of the lid's radius."""
+    pieces: int = 1
+    """The object consists of up to so many pieces that are apart from each other (two berries, some grains). All of
+    them are reconstructed together."""
 
 
 def foreground_masks(
     bins: Sequence[Float[np.ndarray, "bins h w"]],
     config: MaskConfig,
     regions: Bool[np.ndarray, "frames h w"] | None = None,
-) -> Bool[np.ndarray, "frames h w"]:
-    """Masks of the object in all frames, with one threshold.
+) -> tuple[Bool[np.ndarray, "frames h w"], Bool[np.ndarray, "frames"]]:
+    """Masks of the object in all frames, with one threshold, and which frames show a piece that they leave out.
 
     Args:
         regions: pixels of each frame that may be the object's (`above_lid`); all if not given.
 
     Raises:
-        InputError: the spectra of object and background hardly differ.
+        InputError: the number of pieces is below 1; the spectra of object and background hardly differ.
 
     Example:
-        >>> foreground_masks([smoothed_bins(binned)], MaskConfig()).shape  # binned: (24, 512, 512) reflectance
-        (1, 512, 512)
+        >>> masks, left_out = foreground_masks([smoothed_bins(binned)], MaskConfig())  # binned: (24, 512, 512)
+        >>> masks.shape, left_out
+        ((1, 512, 512), array([False]))
     """
+    if config.pieces < 1:
+        raise InputError(f"--masks.pieces is {config.pieces}, but must be 1 or more; correct it.")
     background = background_subspace(bins, regions)
     scores = [foreground_score(image, background) for image in bins]
     threshold = select_threshold(scores, config.threshold)
     lowest = _background_level(scores, threshold)
     weak_fraction = max(config.weak_fraction, min(1.0, lowest / threshold))
-    masks = []
+    masks, left_out = [], []
     for index, score in enumerate(scores):
         region = np.ones(score.shape, bool) if regions is None else regions[index]
-        mask = foreground_mask(score, threshold, region=region, weak_fraction=weak_fraction)
+        pieces = pieces_above(score, threshold, region)
+        left_out.append(len(pieces) > config.pieces)
+        mask = foreground_mask(score, threshold, pieces[: config.pieces], region=region, weak_fraction=weak_fraction)
         brightness = bins[index].mean(axis=0, dtype=np.float32)
         may_grow = region & (score > lowest)
         if config.shaded_fraction is not None:
             shaded = shaded_parts(mask, score, brightness, region=may_grow, fraction=config.shaded_fraction)
             mask = fill_holes(mask | shaded)
         masks.append(at_half_coverage(mask, score, brightness, may_grow))
-    return np.stack(masks)
+    return np.stack(masks), np.array(left_out)
 
 
 def _background_level(scores: Sequence[Float[np.ndarray, "h w"]], threshold: float) -> float:
@@ -126,28 +136,39 @@ def select_threshold(scores: Sequence[Float[np.ndarray, "h w"]], threshold: floa
     return threshold
 
 
+def pieces_above(
+    score: Float[np.ndarray, "h w"], threshold: float, region: Bool[np.ndarray, "h w"]
+) -> list[Bool[np.ndarray, "h w"]]:
+    """The connected pieces above the threshold, with gaps closed and holes filled, the largest first."""
+    closed = ellipse_close_open((score > threshold) & region, close_px=_closing_px(score), open_px=0)
+    return [fill_holes(piece) for piece in components(closed, LEAST_PIECE)]
+
+
 def foreground_mask(
     score: Float[np.ndarray, "h w"],
     threshold: float,
+    pieces: Sequence[Bool[np.ndarray, "h w"]],
     *,
-    region: Bool[np.ndarray, "h w"] | None = None,
+    region: Bool[np.ndarray, "h w"],
     weak_fraction: float = 0.5,
 ) -> Bool[np.ndarray, "h w"]:
-    """The largest connected component above the threshold, with gaps closed, holes filled and thin parts added.
+    """The pieces, with thin parts that stick out of them (a woody stem). Their edges, where pixels are mixed, stay.
 
     Args:
-        region: pixels that may be the object's; all if not given.
-        weak_fraction: thin parts that stick out of the component (a woody stem) are added from this fraction of the
-            threshold on; 1 for none. The component's edge, where pixels are mixed, does not grow.
+        pieces: of the object (`pieces_above`).
+        region: pixels that may be the object's.
+        weak_fraction: thin parts are added from this fraction of the threshold on; 1 for none.
     """
-    region = np.ones(score.shape, dtype=bool) if region is None else region
-    closing_px = max(3, round(CLOSING_FRACTION * min(score.shape)))
-    closed = ellipse_close_open((score > threshold) & region, close_px=closing_px, open_px=0)
-    body = fill_holes(largest_component(closed))
+    closing_px = _closing_px(score)
+    body = np.logical_or.reduce([np.zeros(score.shape, bool), *pieces])
     weak = (score > weak_fraction * threshold) & region
     edge = dilate(body, closing_px)
     sticking_out = touching(weak & ~edge, dilate(edge, 3), min_area_px=closing_px + 1)
     return fill_holes(body | sticking_out | (weak & dilate(sticking_out, closing_px)))
+
+
+def _closing_px(image: Float[np.ndarray, "h w"]) -> int:
+    return max(3, round(CLOSING_FRACTION * min(image.shape)))
 
 
 def above_lid(

@@ -283,12 +283,12 @@ def _write_masks(
         regions = np.stack([above_lid(lens, distortion, pose, container, overhang) for pose in camera_to_worlds])
         lid_middles = np.stack([lid_middle(lens, pose, container) for pose in camera_to_worlds])
     bins = BinsOfFrames(caches)
-    masks = foreground_masks(bins, config, regions)
+    masks, left_out = foreground_masks(bins, config, regions)
     brightness = np.stack([image.mean(axis=0, dtype=np.float32) for image in bins])
     lid_z_m = None if container is None else container.height_m
     names = [frame.capture for frame in frames]
     hull = voted_hull(masks, camera_to_worlds, lens, lid_z_m)
-    findings = check_masks(masks, names, hull.silhouettes, brightness, regions, lid_middles)
+    findings = check_masks(masks, names, hull.silhouettes, brightness, left_out, regions, lid_middles)
     if all(finding.level != "red" for finding in findings):
         masks = hull.trim(masks)
     for frame, mask in zip(frames, masks, strict=True):

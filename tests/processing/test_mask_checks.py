@@ -15,6 +15,7 @@ CONTAINER = Container(diameter_m=0.09, height_m=0.07)
 FRAMES = 12
 POSES = np.stack([true_pose(angle) for angle in np.arange(FRAMES) * 360.0 / FRAMES])
 NAMES = [f"ball_{i}" for i in range(FRAMES)]
+NOTHING = np.zeros(FRAMES, bool)
 REGIONS = np.stack([above_lid(INTRINSICS, np.zeros(4), pose, CONTAINER) for pose in POSES])
 
 
@@ -38,9 +39,9 @@ def findings(masks, brightness=None, regions=None) -> dict[str, str]:
     return {finding.name: finding.level for finding in checked(masks, brightness, regions)}
 
 
-def checked(masks, brightness, regions=None, lid_middles=None):
+def checked(masks, brightness, regions=None, lid_middles=None, left_out=NOTHING):
     silhouettes = voted_hull(masks, POSES, INTRINSICS).silhouettes
-    return check_masks(masks, NAMES, silhouettes, brightness, regions, lid_middles)
+    return check_masks(masks, NAMES, silhouettes, brightness, left_out, regions, lid_middles)
 
 
 def test_good_masks_have_no_finding():
@@ -62,6 +63,13 @@ def test_a_mask_at_the_border_of_the_image():
     assert findings(masks)["masks-border"] == "amber"
     masks[:, 0, 30] = True
     assert findings(masks)["masks-border"] == "red"
+
+
+@pytest.mark.parametrize(("frames", "named"), [(3, set()), (4, {"masks-pieces"})])
+def test_a_piece_that_many_masks_leave_out_is_told(frames, named):
+    masks = good_masks()
+    found = checked(masks, seen(masks), left_out=np.arange(FRAMES) < frames)
+    assert {(finding.name, finding.level) for finding in found} == {(name, "amber") for name in named}
 
 
 def test_masks_of_a_wall_are_cut_by_the_space_above_the_lid():

@@ -18,6 +18,7 @@ from hsi_sc_nerf.processing.masks import (
     foreground_masks,
     lid_middle,
     mask_picture,
+    pieces_above,
     select_threshold,
     shaded_parts,
 )
@@ -28,6 +29,29 @@ from hsi_sc_nerf.simulate.truth import load_truth
 
 NO_DISTORTION = np.zeros(4)
 CONTAINER = Container(diameter_m=0.09, height_m=0.07)
+
+
+def largest_piece(score, threshold, region=None, **kwargs) -> np.ndarray:
+    region = np.ones(score.shape, bool) if region is None else region
+    pieces = pieces_above(score, threshold, region)[:1]
+    return foreground_mask(score, threshold, pieces, region=region, **kwargs)
+
+
+def test_pieces_of_an_object_are_masked_together_and_others_are_told():
+    bins = np.full((2, 8, 90, 90), 0.5, np.float32)  # a gray wall
+    for image, samples in zip(bins, ((20, 70), (20, 31)), strict=True):  # two balls; in the second frame they touch
+        for sample, radius in zip(samples, (10, 6), strict=True):
+            inside = np.hypot(*(np.mgrid[:90, :90] - np.array([45, sample])[:, None, None])) < radius
+            image[:, inside] = np.linspace(0.1, 0.9, 8)[:, None]
+    coloured = bins[:, 0] < 0.3
+    one, left_out = foreground_masks(bins, MaskConfig())
+    np.testing.assert_array_equal(left_out, [True, False])
+    np.testing.assert_array_equal(one[0], coloured[0] & (np.arange(90) < 45))
+    both, left_out = foreground_masks(bins, MaskConfig(pieces=2))
+    assert not left_out.any()
+    np.testing.assert_array_equal(both, coloured)
+    with pytest.raises(InputError, match=r"--masks\.pieces is 0"):
+        foreground_masks(bins, MaskConfig(pieces=0))
 
 
 def test_no_contrast():
@@ -46,23 +70,24 @@ def test_mask_is_one_whole_region_with_its_stem():
     score[20:50, 45] = 0.12  # the fruit's rim, part background
     score[2:6, 2:6] = 0.3  # something else
     score[30, 46:49] = 0.12  # noise
-    mask = foreground_mask(score, 0.2)
+    mask = largest_piece(score, 0.2)
     expected = np.zeros((60, 60), bool)
     expected[20:50, 15:45] = True
     expected[5:20, 30] = True
     np.testing.assert_array_equal(mask, expected)
-    assert not foreground_mask(score, 0.2, weak_fraction=1.0)[:20].any()
+    assert not largest_piece(score, 0.2, weak_fraction=1.0)[:20].any()
     region = np.ones((60, 60), bool)
     region[40:] = False
-    assert not foreground_mask(score, 0.2, region=region)[40:].any()
-    assert not foreground_mask(np.zeros((60, 60)), 0.2).any()
+    assert not largest_piece(score, 0.2, region=region)[40:].any()
+    assert not largest_piece(np.zeros((60, 60)), 0.2).any()
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 77.0])
 def test_mask_of_a_sphere(angle_deg):
     bins = smoothed_bins(np.moveaxis(frame_reflectance(angle_deg), -1, 0))
     truth = sphere_mask(true_pose(angle_deg))
-    (mask,) = foreground_masks([bins], MaskConfig())
+    (mask,), left_out = foreground_masks([bins], MaskConfig())
+    assert not left_out.any()
     assert (mask & truth).sum() / (mask | truth).sum() > 0.97
 
 
@@ -165,7 +190,7 @@ def shaded_ball(background: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def test_shaded_parts_are_told_by_spread_relative_to_brightness():
     bins, ball, light = shaded_ball(background=0.9)
     score, bright = bins.std(axis=0), bins.mean(axis=0)
-    body = foreground_mask(score, 0.1)
+    body = largest_piece(score, 0.1)
     assert (ball & ~body).sum() > 60  # what the score alone misses
     shaded = shaded_parts(body, score, bright)
     rim = ball & ~ndimage.binary_erosion(ball)
@@ -181,7 +206,7 @@ def test_before_a_dark_background_only_what_is_darker_still_is_a_shaded_part():
     bins, ball, light = shaded_ball(background=0.1)
     bins += np.random.default_rng(0).normal(0.0, 0.02, bins.shape).astype(np.float32)
     score, bright = bins.std(axis=0), bins.mean(axis=0)
-    body = foreground_mask(score, 0.1)
+    body = largest_piece(score, 0.1)
     shaded = shaded_parts(body, score, bright, region=score > 0.04)
     assert not (shaded & ~(ball & (light < 0.3))).any()
     assert not shaded_parts(np.zeros_like(body), score, bright).any()
@@ -193,7 +218,7 @@ def test_shaded_parts_before_a_dark_wall_are_found_beside_a_brighter_lid():
     below = np.mgrid[:60, :60][0] > 42
     bins = np.where(below & ~ball, 0.9, bins)
     score, bright = bins.std(axis=0), bins.mean(axis=0)
-    body = foreground_mask(score, 0.1)
+    body = largest_piece(score, 0.1)
     shaded = shaded_parts(body, score, bright)
     assert (ball & below & (light > 0.15) & ~body & ~shaded).sum() < 0.1 * (ball & below & ~body).sum()
     assert not (shaded & ~ball).any()

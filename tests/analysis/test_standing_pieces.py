@@ -1,0 +1,63 @@
+"""Objects that stand apart in one cloud are told apart and measured one by one."""
+
+import numpy as np
+import pytest
+from standing_sphere import RADIUS_M, STAND_M, sphere_points
+
+from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
+from hsi_sc_nerf.analysis.measurement import measure_traits
+from hsi_sc_nerf.analysis.standing_pieces import one_piece, standing_pieces
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.export.cloud import SpectralCloud
+
+CONFIG = MeshConfig(octree_depth=6, base_height_m=STAND_M)
+
+
+def balls(*scales_and_places) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points and normals of spheres of the usual one's size times a scale, moved in metres, and the ball of each."""
+    points, normals = sphere_points(12000, above=-0.93)
+    foot = np.array([0.0, 0.0, STAND_M])
+    moved = [scale * (points - foot) + foot + place for scale, place in scales_and_places]
+    ball = np.repeat(np.arange(len(moved)), len(points))
+    return np.concatenate(moved), np.tile(normals, (len(moved), 1)), ball
+
+
+def cloud_of(points, normals) -> SpectralCloud:
+    colours, spectra = np.zeros((len(points), 3), np.uint8), np.full((len(points), 2), 0.5)
+    return SpectralCloud(points, normals, colours, spectra, np.array([500.0, 600.0]))
+
+
+def test_pieces_that_stand_apart_are_told_apart_by_size():
+    points, _, ball = balls((0.6, [-0.06, 0, 0]), (1.0, [0.06, 0, 0]))
+    order = np.random.default_rng(0).permutation(len(points))
+    found = standing_pieces(points[order], CONFIG)
+    assert [set(ball[order][piece]) for piece in found] == [{1}, {0}]
+    assert sum(map(len, found)) == len(points)
+
+
+@pytest.mark.parametrize(
+    "second",
+    [
+        (1.0, [0, 2 * RADIUS_M + 0.0005, 0]),  # touches the first
+        (0.4, [0, 0, 2 * RADIUS_M + 0.01]),  # hangs over it, as a stem that training left apart
+        (0.1, [0, 2 * RADIUS_M, 0]),  # a speck
+    ],
+)
+def test_what_is_no_object_of_its_own_belongs_to_the_other(second):
+    points, _, _ = balls((1.0, [0, 0, 0]), second)
+    (piece,) = standing_pieces(points, CONFIG)
+    np.testing.assert_array_equal(piece, np.arange(len(points)))
+
+
+@pytest.mark.slow
+def test_sizes_are_those_of_one_object():
+    points, normals, _ = balls((0.6, [-0.06, 0, 0]), (1.0, [0.06, 0, 0]))
+    cloud = cloud_of(points, normals)
+    with pytest.raises(InputError, match=r"2 objects that stand apart.*--piece 1 to --piece 2"):
+        measure_traits(cloud, mesh=CONFIG, splits=0)
+    ball_l = 4000 * np.pi * RADIUS_M**3 / 3
+    for piece, volume_l in ((1, ball_l), (2, 0.6**3 * ball_l)):
+        measured = measure_traits(cloud, mesh=CONFIG, splits=0, piece=piece)
+        assert measured.size.volume_l == pytest.approx(volume_l, rel=0.02)
+    with pytest.raises(InputError, match="--piece is 3, but the cloud holds 2; choose 1 to 2"):
+        one_piece(cloud, 3, CONFIG)
