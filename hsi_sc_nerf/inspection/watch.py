@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hsi_sc_nerf.calibration.detector import DIGITISER_LIMITS
 from hsi_sc_nerf.capture.instrument import CaptureFiles, list_captures
 from hsi_sc_nerf.capture.session import SESSION_INFO_NAME, Capture, open_captures
 from hsi_sc_nerf.capture.session_info import SessionInfo, read_session_info
@@ -85,7 +86,7 @@ class Watch:
 
     def _line(self, capture: Capture, dictionary: str | None, is_white: bool) -> str:
         quicklook = quicklook_of(capture, white_counts(capture))
-        saturated = float(quicklook.at_top_fraction.mean()) if _is_full_scale(quicklook.top_counts) else 0.0
+        saturated = float(quicklook.at_top_fraction.mean()) if quicklook.top_counts in DIGITISER_LIMITS else 0.0
         dark = float(quicklook.dark_fraction.mean())
         parts = [f"saturated {100.0 * saturated:.1f} %", f"dark {100.0 * dark:.1f} %"]
         faults = []
@@ -121,8 +122,3 @@ class Watch:
         self._quicklooks.append(quicklook)
         self._markers.append(markers)
         return faults
-
-
-def _is_full_scale(top_counts: float) -> bool:
-    """Whether the largest reading is the limit of a digitiser of 8 to 16 bits."""
-    return top_counts in {2.0**bits - 1.0 for bits in range(8, 17)}

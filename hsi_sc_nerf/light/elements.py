@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.evaluation.spatial import sample_surface
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, unit_vectors
+from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene, unoccluded
 from hsi_sc_nerf.geometry.ray_projection import image_coordinates
 from hsi_sc_nerf.light.views import Views
 
@@ -101,8 +101,7 @@ def shown_points(
     scanned = Mesh(whole.vertices, whole.triangles[elements.on_object[elements.of_triangle]])
     points = sample_surface(scanned.vertices, scanned.triangles, POINTS_EACH * int(elements.on_object.sum()))
     facets = ray_scene(scanned.vertices, scanned.triangles).compute_closest_points(points.astype(np.float32))
-    normals = facets["primitive_normals"].numpy().astype(float)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    normals = unit_vectors(facets["primitive_normals"].numpy().astype(float))
     near = cKDTree(points).query_ball_point(elements.positions, radius_m)
     element = np.repeat(np.arange(count), [len(some) for some in near])
     point = np.concatenate([np.asarray(some, int) for some in near])
@@ -111,9 +110,9 @@ def shown_points(
     shape = count, len(points)
     weights = scipy.sparse.csr_array((cosine[kept], (element[kept], point[kept])), shape=shape)
     # What lies in a groove is hidden to one who looks along the mean normal of the elements around.
-    sight = np.concatenate([points + lift_m * normals, weights.T @ elements.normals], axis=1, dtype=np.float32)
-    hidden = ray_scene(whole.vertices, whole.triangles).test_occlusions(sight).numpy()
-    weights = weights @ scipy.sparse.diags_array(1.0 - hidden)
+    scene = ray_scene(whole.vertices, whole.triangles)
+    visible = unoccluded(scene, points + lift_m * normals, weights.T @ elements.normals)
+    weights = weights @ scipy.sparse.diags_array(visible.astype(float))
     # An element that is left without a point, and those of the support, stand for themselves.
     alone = weights.sum(axis=1) <= 0.0
     weights = scipy.sparse.hstack([weights, scipy.sparse.diags_array(alone.astype(float))], format="csr")
@@ -131,7 +130,7 @@ def smooth_normals(mesh: Mesh, positions: Float[np.ndarray, "n 3"], radius_m: fl
     sums = np.empty((len(positions), 3))
     for row, near in enumerate(tree.query_ball_point(positions, radius_m)):
         sums[row] = vertices[near].sum(axis=0) if near else vertices[nearest[row]]
-    return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-30)
+    return unit_vectors(sums)
 
 
 def _nearest(
@@ -203,16 +202,14 @@ def observe(
     least = np.cos(np.deg2rad(least))
     found: list[tuple[np.ndarray, ...]] = []
     for frame, pose in enumerate(camera_to_world):
-        sight = pose[:3, 3] - elements.positions
-        sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+        sight = unit_vectors(pose[:3, 3] - elements.positions)
         in_camera = torch.from_numpy((elements.positions - pose[:3, 3]) @ pose[:3, :3])
         xy, forward = image_coordinates(in_camera, intrinsics, distortion)
         # Pixel centres lie at half numbers.
         corner = np.floor(xy.numpy() - 0.5)
         inside = (corner >= 0.0).all(axis=1) & (corner < [intrinsics.w - 1, intrinsics.h - 1]).all(axis=1)
         seen = np.flatnonzero((np.einsum("nk,nk->n", elements.normals, sight) > least) & inside & forward.numpy())
-        rays = np.concatenate([starts[seen], sight[seen]], axis=1, dtype=np.float32)
-        seen = seen[~scene.test_occlusions(rays).numpy()]
+        seen = seen[unoccluded(scene, starts[seen], sight[seen])]
         sample, line = corner[seen].astype(int).T
         part = xy.numpy()[seen] - 0.5 - corner[seen]
         value, of_object, across, along = 0.0, [], 0.0, 0.0

@@ -17,6 +17,7 @@ import scipy.sparse
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
+from hsi_sc_nerf.geometry.camera import unit_vectors
 from hsi_sc_nerf.light.shared_errors import CORRELATED, SMALLEST_SCATTER, SharedErrors, scatter_beyond, tukey_weights
 from hsi_sc_nerf.light.standing_light import (
     DEGREE,
@@ -307,7 +308,7 @@ class _Fit:
                 light,
                 chamber=light.chamber + step[:TERMS],
                 lamps=np.maximum(light.lamps + step[TERMS : TERMS + lamps], 0.1 * light.lamps),
-                to_lamps=to_lamps / np.maximum(np.linalg.norm(to_lamps, axis=1, keepdims=True), 1e-9),
+                to_lamps=unit_vectors(to_lamps),
                 nearness=float(np.clip(light.nearness + step[-1], 0.0, 1.0 / LEAST_DISTANCE_M)) if lamps else 0.0,
             )
         )

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.mesh import Mesh
@@ -22,6 +21,7 @@ from hsi_sc_nerf.light.material import ObjectLight, light_on_object, turning_ele
 from hsi_sc_nerf.light.views import TurningElements, Views
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.packed.cube import unpack
+from hsi_sc_nerf.processing.view_changes import like_spectra
 from hsi_sc_nerf.surface.depth_renders import DepthRenders, render_depth_maps
 from hsi_sc_nerf.surface.outline_opacity import outline_opacity
 from hsi_sc_nerf.surface.surface_points import SurfaceMesh, surface_mesh
@@ -34,8 +34,6 @@ SMOOTHING_M = 0.003
 """Normals and light are means over this radius: the mesh is rough by its voxels, and pixels show no more."""
 LEAST_VIEWS = 200
 """Fewer measurements tell nothing of the light."""
-ALIKE = 12
-"""Each element is compared with so many others of the most similar spectra."""
 LEAST_UNEVENNESS = 0.01
 """Irradiance that varies by less over the object changes no result."""
 CERTAIN = 3.0
@@ -191,8 +189,7 @@ def shading_evidence(elements: TurningElements, views: Views, fit: LightFit) -> 
     turning = _slope(brighter, lighter, weights, cells[element])
     seen = np.unique(element)
     spectra = np.stack([np.bincount(element, weights * band, count) for band in views.reflectance[rows].T], axis=-1)
-    shapes = spectra[seen] / np.linalg.norm(spectra[seen], axis=1, keepdims=True)
-    _, alike = cKDTree(shapes).query(shapes, min(ALIKE + 1, len(seen)))
+    alike = like_spectra(spectra[seen])
     # Each against the mean of those like it, itself among them.
     own_brighter, own_lighter = (mean[seen] - mean[seen][alike].mean(axis=1) for mean in means)
     profile = _slope(own_brighter, own_lighter, np.ones(len(seen)), cells[seen])

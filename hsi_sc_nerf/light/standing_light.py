@@ -14,6 +14,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import sph_harm_y
 
+from hsi_sc_nerf.geometry.camera import unit_vectors
+
 DEGREE = 2
 """Largest degree of the chamber's harmonics: irradiance hardly shows higher ones (Ramamoorthi and Hanrahan 2001)."""
 TERMS = (DEGREE + 1) ** 2
@@ -106,6 +108,5 @@ def lobes(
 def tangents(towards: Float[np.ndarray, "lamps 3"]) -> Float[np.ndarray, "lamps 2 3"]:
     """Two unit vectors perpendicular to each other and to each of the given ones."""
     helper = np.eye(3)[np.abs(towards).argmin(axis=1)]
-    first = np.cross(towards, helper)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    first = unit_vectors(np.cross(towards, helper))
     return np.stack([first, np.cross(towards, first)], axis=1)

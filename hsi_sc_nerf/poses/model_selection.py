@@ -338,4 +338,15 @@ def _evidence(more: Adjusted, less: Adjusted) -> float:
     if more.problem.numbers <= more.problem.layout.size:
         return 0.0
     ratio = (less.cost - more.cost) / extra / more.variance
-    return float(-np.log10(max(f_distribution.sf(ratio, extra, more.degrees_of_freedom), _SMALLEST_P)))
+    return f_test_evidence(ratio, extra, more.degrees_of_freedom)
+
+
+def f_test_evidence(ratio: float, extra: int, degrees_of_freedom: int) -> float:
+    """-log10 of the probability of at least this ratio of variances by chance (F-test).
+
+    Args:
+        ratio: sum of squares that ``extra`` parameters explain, over their number and the residuals' variance.
+        extra: number of these parameters.
+        degrees_of_freedom: of the residuals' variance.
+    """
+    return float(-np.log10(max(f_distribution.sf(ratio, extra, degrees_of_freedom), _SMALLEST_P)))

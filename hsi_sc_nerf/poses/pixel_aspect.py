@@ -9,11 +9,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import f as f_distribution
 
 from hsi_sc_nerf.findings import Finding, Level
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, Problem
-from hsi_sc_nerf.poses.model_selection import EVIDENCE_NEEDED, LOSS_SIGMAS
+from hsi_sc_nerf.poses.model_selection import EVIDENCE_NEEDED, LOSS_SIGMAS, f_test_evidence
 from hsi_sc_nerf.poses.residuals import MarkerResiduals
 from hsi_sc_nerf.poses.turntable import MarkerObservations
 
@@ -21,7 +20,6 @@ ASPECT_AMBER, ASPECT_RED = 0.005, 0.015
 """Departures from square pixels. One of 0.03 moves poses by a centimetre (docs/validation/sessions.md)."""
 _STEP, _ROUNDS = 0.02, 3
 """Steps of the logarithm in which the best spacing is looked for."""
-_SMALLEST_P = 1e-99
 
 
 def pixel_aspect(adjusted: Adjusted, observations: MarkerObservations) -> tuple[float, float]:
@@ -59,8 +57,7 @@ def pixel_aspect(adjusted: Adjusted, observations: MarkerObservations) -> tuple[
         best += float(np.clip(move, -4.0 * _STEP, 4.0 * _STEP))
         found = solved(best)
     gain = max(cost_of_squares - found.cost, 0.0) / found.variance
-    p_value = max(float(f_distribution.sf(gain, 1, found.degrees_of_freedom)), _SMALLEST_P)
-    return float(np.exp(best)), float(-np.log10(p_value))
+    return float(np.exp(best)), f_test_evidence(gain, 1, found.degrees_of_freedom)
 
 
 def stretched(observations: MarkerObservations, factor: float, centre_px: float) -> MarkerObservations:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, closest_point_to_rays
+from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, closest_point_to_rays, unit_vectors
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters, Problem
 from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS
 from hsi_sc_nerf.poses.posed_session import with_hidden_errors
@@ -195,7 +195,7 @@ def with_markers(turntable: Turntable, seen: MarkerObservations) -> Turntable:
     markers, marker, views = np.unique(seen.marker, return_inverse=True, return_counts=True)
     poses = turntable.camera_to_world()[np.searchsorted(turntable.frames, seen.frame)] @ OPENCV_TO_OPENGL
     in_camera = np.insert((seen.corners_px - turntable.centre_px) / turntable.focal_px, 2, 1.0, axis=-1)
-    directions = in_camera / np.linalg.norm(in_camera, axis=-1, keepdims=True) @ np.swapaxes(poses[:, :3, :3], 1, 2)
+    directions = unit_vectors(in_camera) @ np.swapaxes(poses[:, :3, :3], 1, 2)
     corners, eigenvalue = closest_point_to_rays(poses[:, None, :3, 3], directions, 4 * marker[:, None] + np.arange(4))
     placed = eigenvalue.reshape(-1, 4).min(axis=1) > _LEAST_EIGENVALUE * views
     faces = corners.reshape(-1, 4, 3)[placed]

@@ -23,7 +23,7 @@ from hsi_sc_nerf.poses.pose_methods import PoseMethod
 from hsi_sc_nerf.poses.report import check_poses, describe_poses, draw_poses, pose_report
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.session_pictures import GRAY, read_pictures
-from hsi_sc_nerf.processing.frames import FramePaths
+from hsi_sc_nerf.processing.frames import MARKER_RANGE_NM, FramePaths
 
 _log = logging.getLogger(__name__)
 
@@ -40,7 +40,7 @@ def pose_frames(
     output_dir: Path,
     console: Console,
     find_poses: PoseFunction,
-    marker_range_nm: tuple[float, float] = (450.0, 700.0),
+    marker_range_nm: tuple[float, float] = MARKER_RANGE_NM,
     check: Callable[[Sequence[Finding]], None] = refuse_red,
 ) -> TurntablePoses:
     """Find and check the poses, write ``poses.json`` and its figure, and print what was found.

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project, project_distorted
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project, project_distorted, unit_vectors
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.processing.voted_hull import VotedHull
 
@@ -26,7 +26,7 @@ NORMAL_CELLS = 6
 MOST_CHANGE = 1.0
 """Relative changes are cut off here: larger ones are the chamber's pixels in a wrong mask."""
 ALIKE = 12
-"""A point's brightness is compared with that of so many others of the most similar spectra."""
+"""The brightness of a point is compared with that of this many others, those with the most similar spectra."""
 _RIDGE = 1e-6
 _LEAST_RIDGE = 1e-12
 COLOURS = 6
@@ -84,15 +84,19 @@ def change_with_height(views: PointViews) -> Change:
     spectra = mean_by_index(views.reflectance, views.point, count)
     seen = np.unique(views.point)
     spectra = np.maximum(spectra[seen], 1e-4)
-    brightness = np.log(spectra.mean(axis=1))
-    shapes = spectra / np.linalg.norm(spectra, axis=1, keepdims=True)
-    _, alike = cKDTree(shapes).query(shapes, min(ALIKE + 1, len(seen)))
+    brightness, alike = np.log(spectra.mean(axis=1)), like_spectra(spectra)
     height, slope = (_tertile(values[seen]) for values in (views.positions_m[:, 2], views.normals[:, 2]))
     causes = _indicators(3 * height + slope)
     causes = causes - causes[alike].mean(axis=1)
     response = brightness - brightness[alike].mean(axis=1)
     rows = _rows_of(views.sector[seen])
     return _predicted([[_products(causes[part], response[part]) for part in rows]], causes.shape[1])
+
+
+def like_spectra(spectra: Float[np.ndarray, "n bands"]) -> Int[np.ndarray, "n alike"]:
+    """Rows of the `ALIKE` spectra most similar in shape to each spectrum, and its own row."""
+    shapes = unit_vectors(spectra)
+    return cKDTree(shapes).query(shapes, min(ALIKE + 1, len(shapes)))[1]
 
 
 def facing_cell(views: PointViews) -> Int[np.ndarray, "n"]:

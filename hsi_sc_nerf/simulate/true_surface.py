@@ -6,14 +6,13 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.comparison import CompareConfig, Reference, Track, surface_of, without_progress
-from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL
-from hsi_sc_nerf.geometry.mesh import ray_scene
+from hsi_sc_nerf.geometry.camera import project, project_distorted, unit_vectors
+from hsi_sc_nerf.geometry.mesh import ray_scene, unoccluded
 from hsi_sc_nerf.simulate.truth import COVERED, Truth, load_truth
 
 if TYPE_CHECKING:
@@ -83,21 +82,18 @@ def seen_points(
         candidates = candidates[_in_object_pixels(truth, capture, poses[capture], points_m[candidates])]
         if not len(candidates):
             continue
-        seen[candidates] = unoccluded(scene, points_m[candidates], poses[capture][:3, 3])
+        seen[candidates] = visible_from(scene, points_m[candidates], poses[capture][:3, 3])
     return seen
 
 
-def unoccluded(
+def visible_from(
     scene: RaycastingScene,
     points_m: Float[np.ndarray, "n 3"],
     eye_m: Float[np.ndarray, "3"],
     lift_m: float = LIFT_M,
 ) -> Bool[np.ndarray, "n"]:
     """Whether each point of a surface is visible from ``eye_m``; occluders within ``lift_m`` of it do not count."""
-    sight = eye_m - points_m
-    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
-    rays = np.concatenate([points_m, sight], axis=1, dtype=np.float32)
-    return ~scene.test_occlusions(rays, tnear=lift_m).numpy()
+    return unoccluded(scene, points_m, unit_vectors(eye_m - points_m), lift_m)
 
 
 def _in_object_pixels(
@@ -106,13 +102,10 @@ def _in_object_pixels(
     coverage = truth.object_coverage(capture)
     if not len(points_m):
         return np.zeros(0, bool)
-    world_to_camera = np.linalg.inv(camera_to_world @ OPENCV_TO_OPENGL)
-    in_camera = points_m @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
-    pixels, _ = cv2.projectPoints(
-        in_camera, np.zeros(3), np.zeros(3), truth.intrinsics.matrix(), np.array(truth.distortion)
-    )
-    columns, lines = np.floor(pixels[:, 0]).astype(int).T
-    inside = (in_camera[:, 2] > 0) & (lines >= 0) & (lines < coverage.shape[0])
+    depth = project(points_m, camera_to_world, truth.intrinsics)[1]
+    pixels = project_distorted(points_m, camera_to_world, truth.intrinsics, np.array(truth.distortion))
+    columns, lines = np.floor(pixels).astype(int).T
+    inside = (depth > 0) & (lines >= 0) & (lines < coverage.shape[0])
     inside &= (columns >= 0) & (columns < coverage.shape[1])
     shown = np.zeros(len(points_m), bool)
     shown[inside] = coverage[lines[inside], columns[inside]] >= COVERED

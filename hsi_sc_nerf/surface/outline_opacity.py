@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
+from hsi_sc_nerf.geometry.camera import unit_vectors
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.packed.pixels import PixelSampler
 from hsi_sc_nerf.processing.chamber import turntable_silhouette
@@ -139,8 +140,8 @@ def outline_pixels(
         depth_px = ndimage.distance_transform_edt(mask) - ndimage.distance_transform_edt(~mask)
         chamber = before_chamber(frame)
         on = np.argwhere((depth_px >= depths_px[0]) & (depth_px <= depths_px[1]) & chamber)
-        inwards = np.stack(np.gradient(ndimage.gaussian_filter(depth_px, _SMOOTHING_PX)), axis=-1)[tuple(on.T)]
-        inwards /= np.maximum(np.linalg.norm(inwards, axis=1, keepdims=True), 1e-9)
+        gradient = np.stack(np.gradient(ndimage.gaussian_filter(depth_px, _SMOOTHING_PX)), axis=-1)
+        inwards = unit_vectors(gradient[tuple(on.T)])
         of_on = depth_px[tuple(on.T)][:, None]
         inside, outside = (np.rint(on + (to_px - of_on) * inwards).astype(int) for to_px in (inside_px, -PURE_PX))
         within = [((places >= 0) & (places < mask.shape)).all(axis=1) for places in (inside, outside)]

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.spatial import sample_surface
+from hsi_sc_nerf.geometry.camera import unit_vectors
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.surface.depth_renders import DepthRenders
@@ -225,8 +226,7 @@ class SurfaceMesh(Mesh):
         """Outward unit normals: area-weighted mean over the ``NORMAL_VERTICES`` nearest vertices."""
         tree, vertex_normals = self._search
         _, nearest = tree.query(points, k=min(NORMAL_VERTICES, len(self.vertices)))
-        normals = vertex_normals[nearest.reshape(len(points), -1)].sum(axis=1)
-        return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+        return unit_vectors(vertex_normals[nearest.reshape(len(points), -1)].sum(axis=1))
 
     def triangles_in(self, box: Float[np.ndarray, "2 3"]) -> Int[np.ndarray, "near 3"]:
         """Triangles with an area whose bounding boxes touch a box."""
