@@ -14,7 +14,7 @@ from hsi_sc_nerf.evaluation.spatial import sample_surface
 from hsi_sc_nerf.export.cloud import SpectralCloud
 from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene
 from hsi_sc_nerf.geometry.ply_file import read_ply
-from hsi_sc_nerf.simulate.true_surface import visible_from
+from hsi_sc_nerf.simulate.scores import visible_from
 from hsi_sc_nerf.simulate.truth import Truth
 from hsi_sc_nerf.spectra import composite, to_8_bit
 

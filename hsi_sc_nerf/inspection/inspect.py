@@ -13,8 +13,7 @@ import numpy as np
 from matplotlib import rc_context
 
 from hsi_sc_nerf.calibration.calibration_checks import check_white
-from hsi_sc_nerf.calibration.dark_checks import check_dark
-from hsi_sc_nerf.calibration.line_checks import check_lines
+from hsi_sc_nerf.calibration.reference_checks import check_dark, check_lines
 from hsi_sc_nerf.calibration.white_source import WhiteSource
 from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.capture.session_info import SessionInfo

@@ -23,7 +23,7 @@ from hsi_sc_nerf.calibration.detector import (
     some_lines,
     spread_rows,
 )
-from hsi_sc_nerf.calibration.line_checks import bright_pixels
+from hsi_sc_nerf.calibration.reference_checks import bright_pixels
 from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.poses.session_pictures import edge_slope
 from hsi_sc_nerf.spectra import nearest_bands, to_8_bit

@@ -1,8 +1,13 @@
-"""Does the object look the same in all frames? Shade that falls on one, and an object that slipped on the disc.
+"""Does the object look the same in all frames, and does its spectrum have the right order of bands? As findings.
 
-Masks and markers do not tell either: a shadow leaves the outline, and what turns about its own axis may have one
-outline from all sides. The points of the masks' hull do, as the frames see them (`PointViews`), once the light that
-stands still with the camera is taken away: what changes with the direction that a point faces.
+Masks and markers show neither a shadow on one frame nor an object that slipped on the disc: a shadow does not change
+the outline, and a body of revolution has one outline from all sides. The brightness of the points on the masks' hull
+shows both (`PointViews`), after the part that depends on the direction a point faces is removed: that part is light
+that is stationary in the camera's frame.
+
+A header that lists the wavelengths in reverse mirrors every spectrum. The counts do not show it, because lamp and
+detector are weak at both ends. The object does: biological tissue absorbs blue light and scatters near-infrared
+light, and so do most pigments, also blue ones.
 """
 
 from __future__ import annotations
@@ -14,7 +19,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from scipy.stats import median_abs_deviation
 
-from hsi_sc_nerf.findings import Finding, leave_out, names_in_short
+from hsi_sc_nerf.findings import Finding, Level, leave_out, names_in_short
 from hsi_sc_nerf.poses.turntable import rotations_about_z
 from hsi_sc_nerf.processing.view_changes import PointViews, facing_cell, mean_by_index
 
@@ -43,6 +48,12 @@ LARGEST_SIGMAS = 3.0
 LEAST_SCATTER = 0.003
 """Scatter of a channel (logarithm) that is stated at least."""
 _ROUNDS = 12
+BLUE_NM, INFRARED_NM = (430.0, 500.0), (850.0, 970.0)
+"""Of the 400 to 1000 nm of silicon, one is about the other's mirror image."""
+ORDER_AMBER, ORDER_RED = 1.3, 2.0
+"""Reflectance in the blue over that in the infrared. White and grey things have 1, tissue less."""
+LEAST_BLUE = 0.1
+"""Of darker things noise and stray light may decide."""
 
 
 def check_appearance(views: PointViews, names: Sequence[str]) -> list[Finding]:
@@ -194,3 +205,35 @@ def _change(
         return None
     change = looks[second[near]] - looks[first[nearest[near]]]
     return change - np.median(change, axis=0)
+
+
+def check_band_order(
+    spectrum: Float[np.ndarray, "bands"], wavelengths_nm: Float[np.ndarray, "bands"]
+) -> list[Finding]:
+    """The finding ``band-order`` where the object is far brighter in the blue than in the infrared.
+
+    Args:
+        spectrum: the object's mean reflectance.
+        wavelengths_nm: of its bands.
+
+    Example:
+        >>> check_band_order(np.array([0.6, 0.1]), np.array([450.0, 900.0]))[0].level
+        'red'
+    """
+    in_blue, in_infrared = (
+        (wavelengths_nm >= low) & (wavelengths_nm <= high) for low, high in (BLUE_NM, INFRARED_NM)
+    )
+    if not (in_blue.any() and in_infrared.any()):
+        return []
+    blue, infrared = float(spectrum[in_blue].mean()), float(spectrum[in_infrared].mean())
+    ratio = blue / max(infrared, 1e-3)
+    if blue < LEAST_BLUE or ratio <= ORDER_AMBER:
+        return []
+    level: Level = "red" if ratio > ORDER_RED else "amber"
+    sentence = (
+        f"The object reflects {100.0 * blue:.0f} % from {BLUE_NM[0]:g} to {BLUE_NM[1]:g} nm and "
+        f"{100.0 * infrared:.0f} % from {INFRARED_NM[0]:g} to {INFRARED_NM[1]:g} nm, unlike plants and nearly all "
+        "pigments: the headers probably list the wavelengths in reverse; compare them with a leaf, which is dark at "
+        "680 nm and bright from 750 nm, and correct them."
+    )
+    return [Finding("band-order", level, sentence, {"blue_over_infrared": ratio})]

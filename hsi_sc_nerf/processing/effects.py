@@ -29,7 +29,7 @@ from hsi_sc_nerf.processing.view_changes import (
     change_with_height,
     point_views,
 )
-from hsi_sc_nerf.processing.voted_hull import VotedHull
+from hsi_sc_nerf.processing.visual_hull import VotedHull
 from hsi_sc_nerf.terminal import screen_table
 
 LEAST_VIEW_CHANGE_PERCENT = 0.5

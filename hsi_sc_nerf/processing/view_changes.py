@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project, project_distorted, unit_vectors
 from hsi_sc_nerf.morphology import dilate
-from hsi_sc_nerf.processing.voted_hull import VotedHull
+from hsi_sc_nerf.processing.visual_hull import VotedHull
 
 NORMAL_CELLS = 6
 """Cells of the normals' directions to the right and upwards in the camera's frame."""
