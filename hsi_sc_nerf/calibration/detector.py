@@ -171,9 +171,9 @@ def pooled_darks(
 ) -> list[Float[np.ndarray, "columns bands"]]:
     """The frames' dark counts with the pattern of columns and bands that all share, and each frame's own level.
 
-    A frame's dark cube has few lines, so that its noise is the same in all lines of the frame, and that of a band's
-    level is in all its pixels. A frame's level is one offset of all bands, or has a value in each band where the
-    frames differ so by more than noise. The frames' darks are kept as they are if their columns' patterns differ.
+    A dark cube has few lines. Its noise is subtracted from every line of the frame, and the noise of a band's level
+    from every pixel. A frame's level is one offset for all bands, or one value for each band if the frames differ by
+    more than noise. If the frames' patterns differ, their darks are returned unchanged.
 
     Args:
         read_noise: standard deviation of one reading.

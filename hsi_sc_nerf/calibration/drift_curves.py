@@ -1,9 +1,9 @@
 """Curves of the lamps' drift over wavelength: smooth, and shared by all frames.
 
-Lamps drift with one course over the session or two, each with one spectrum (a low rank over frames and bands). The
-spectrum is a smoothing spline over 1 / wavelength, whose smoothness is the most likely one for the data: where few
-counts tell little, neighbouring bands tell more, and a drift of the blue alone stays in the blue. The course over the
-frames is smooth as well, unless a frame contradicts it: lamps warm up slowly, but may be switched.
+The drift of lamps is a sum of one or two courses over the session, each with one spectrum (a low rank over frames and
+bands). The spectrum is a smoothing spline over 1 / wavelength with the most likely smoothness for the data: in noisy
+bands the neighbouring bands determine it, and a drift of the blue alone stays in the blue. The course over the frames
+is smooth as well, unless a frame contradicts it: lamps warm up slowly, but may be switched.
 
 P. J. Green and B. W. Silverman, "Nonparametric Regression and Generalized Linear Models", 1994; G. Wahba, Annals of
 Statistics 13, 1985; M. Gavish and D. Donoho, "Optimal Shrinkage of Singular Values", 2017.

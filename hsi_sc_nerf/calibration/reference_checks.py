@@ -24,21 +24,22 @@ from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.findings import Finding, judged, leave_out, names_in_short
 
 LIT_AMBER, LIT_RED = 0.002, 0.01
-"""Light in a dark cube over that on the white, which is the reflectance that it takes away. Of a covered lens, dark
-patterns and noise leave less than 0.0001."""
+"""Light in a dark cube relative to the light on the white; reflectance is too low by this. It is below 0.0001 with a
+covered lens."""
 CERTAINTY = 3.0
-"""Standard deviations from which light counts: with few bands, a dark pattern may resemble a lamp."""
+"""Light is reported from this many standard deviations: with few bands, a dark pattern may resemble a lamp."""
 OTHER_TIME = 1.01
-"""Factor between integration times from which they differ."""
+"""Integration times differ if their ratio exceeds this."""
 LINE_AMBER, LINE_RED = 0.03, 0.1
 """Height of a line over the reflectance beside it, as a fraction. Good sessions have less than 0.005."""
 WINDOW_NM, LARGEST_STEP_NM, FEWEST_BANDS = 45.0, 6.0, 40
-"""Span in which reflectance is compared, more than twice a line's width; and bands that tell of lines."""
+"""Width of the median filter, more than twice that of a line; largest step between bands and smallest number of bands
+with which lines can be detected."""
 LEAST_WHITE = 0.1
-"""Light on the white over that of its brightest band. In darker bands a spectrometer's stray light counts, which
-differs from material to material."""
+"""Bands in which the white is darker than this fraction of its brightest band are not used: a spectrometer's stray
+light matters there, and it differs between materials."""
 FRAMES, BRIGHT, PIXELS = 8, 0.3, 250
-"""Frames, fraction of the brightest pixels' light from which pixels are compared, and about so many of a frame."""
+"""Number of compared frames; pixels above this fraction of the brightest are used; about this many of a frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +65,12 @@ def check_dark(
     source: Literal["auto"] | WhiteSource = "auto",
     spectra: Mapping[str, Float[np.ndarray, "bands"] | None] | None = None,
 ) -> Finding:
-    """The finding ``dark``: whether all counts have a dark reference, of their own exposure, without light.
+    """The finding ``dark``: whether every capture has a dark reference of its integration time, without light.
 
     Args:
         session: its captures.
         source: where the white is.
-        spectra: mean counts of captures' dark references that were read before, by name.
+        spectra: mean counts of dark references that were already read, by the name of their capture.
 
     Raises:
         InputError: the session does not have that source of white.
@@ -87,7 +88,7 @@ def check_dark(
     if without:
         sentence = (
             f"{session.path}: {names_in_short(without)} {'has' if len(without) == 1 else 'have'} no dark reference, "
-            "unlike the other captures, so that the detector's offset would count as light; copy it there"
+            "unlike the other captures, so the detector's offset would be taken for light; copy it there"
         )
         frames = [frame.name for frame in session.frames if frame.name in without]
         advice = f" or leave out with {leave_out(frames)}" if 0 < len(frames) < len(session.frames) else ""
@@ -114,7 +115,7 @@ def check_dark(
     if other:
         sentence = (
             f"{session.path}: by their headers the dark references of {names_in_short(other)} have another "
-            "integration time than the captures; dark counts grow with it, so take them alike."
+            "integration time than the captures; dark counts grow with it, so take both with the same time."
         )
         return Finding("dark", "amber", sentence, values | {"other_integration_time": other})
     return Finding("dark", "green", "Dark references: every capture has one, without light.", values)
@@ -150,7 +151,7 @@ def light_over_white(dark: Float[np.ndarray, "bands"], white: Float[np.ndarray, 
 
 
 def _without_any(session: Session, exposures: Sequence[_Exposure]) -> Finding:
-    """No capture has a dark: right for counts whose offset is gone, which then reach zero."""
+    """No capture has a dark reference. This is right if the counts reach zero, because their offset was removed."""
     some = [some_lines(exposure.counts) for exposure in exposures]
     lowest = min(float(np.percentile(counts, 0.1)) for counts in some)
     brightest = max(float(counts.max()) for counts in some)
@@ -158,7 +159,7 @@ def _without_any(session: Session, exposures: Sequence[_Exposure]) -> Finding:
     if lowest <= LIT_AMBER * brightest:
         return Finding("dark", "green", "No capture has a dark reference, and the counts reach zero.", values)
     sentence = (
-        f"{session.path}: no capture has a dark reference, and hardly a count is below {lowest:.4g}, which may be "
+        f"{session.path}: no capture has a dark reference, and hardly any count is below {lowest:.4g}, which may be "
         "the detector's offset; take a dark reference with a covered lens."
     )
     return Finding("dark", "amber", sentence, values)
@@ -195,13 +196,13 @@ def check_lines(
     height = line_heights(np.concatenate(spectra), window)
     worst = int(np.abs(height).argmax())
     text = (
-        f"at {wavelengths_nm[lit][worst]:.0f} nm all of the frames differ by {100.0 * abs(height[worst]):.2g} % from "
-        "the bands beside it"
+        f"at {wavelengths_nm[lit][worst]:.0f} nm the reflectance of all frames differs by "
+        f"{100.0 * abs(height[worst]):.2g} % from that in the neighbouring bands"
     )
     lit_alone = "the frames" if height[worst] > 0.0 else "the white"
     advice = (
-        f"a lamp with lines, such as a room's or a screen's, shone on {lit_alone} only; switch it off and take them "
-        "again"
+        f"a lamp with narrow lines, such as a room's lamp or a screen, shone on {lit_alone} only; switch it off and "
+        "take them again"
     )
     limits = LINE_AMBER, LINE_RED
     return [judged("light-lines", float(np.abs(height[worst])), limits, f"{session.path}: {text}", advice)]

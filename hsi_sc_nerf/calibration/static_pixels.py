@@ -16,7 +16,8 @@ from scipy import stats
 from hsi_sc_nerf.robust_scatter import robust_std
 
 MIN_PIXELS, MIN_FRACTION, MIN_SCATTERING_FRACTION = 64, 0.05, 0.15
-"""Fewest static pixels, and their least fraction of all, without and with scatter: it leaves more room for chance."""
+"""Fewest static pixels, and their least fraction of all pixels without and with scatter: with scatter, more pixels
+follow a course by chance."""
 MIN_SIGNAL = 10.0
 """Least signal-to-noise ratio of a pixel's bin, so that its logarithm is normal."""
 TOLERANCE = 0.002

@@ -41,7 +41,7 @@ class Inspection:
     Attributes:
         session: the session, with the rotation of its images as measured.
         quicklooks: of each frame.
-        markers: what is seen of markers.
+        markers: the markers of the frames.
         findings: results of all checks.
         session_json: content of ``session.json`` with what could be measured filled in; None for what is not known.
     """
@@ -109,10 +109,9 @@ def _upright(session: Session, markers: Markers) -> tuple[Session, Finding]:
     values = {"stated_deg": session.info.image_rotation_deg, "measured_deg": measured}
     assumed = session.image_rotation_deg
     if measured is None:
-        source = "session.json" if session.info.image_rotation_deg is not None else "the instrument's habit"
-        return session, Finding(
-            "upright", "green", f"Upright: images are rotated by {assumed} degrees by {source}.", values
-        )
+        source = "session.json" if session.info.image_rotation_deg is not None else "the instrument's default"
+        sentence = f"Upright: images are rotated by {assumed} degrees, according to {source}."
+        return session, Finding("upright", "green", sentence, values)
     if session.info.image_rotation_deg is not None and measured != assumed:
         sentence = (
             f"{session.info_path}: states image_rotation_deg {assumed}, but by the markers it is {measured}; correct "
@@ -146,12 +145,14 @@ def filled_in(session: Session, markers: Markers) -> dict[str, object]:
 def suggestion(session: Session, content: dict[str, object]) -> str:
     """Lines that show a ``session.json`` to copy."""
     missing = [key for key, value in content.items() if value is None]
-    ask = f" with {', '.join(missing)} in the place of null" if missing else ""
-    return f"This is what the frames show; write it to {session.info_path}{ask}:\n{json.dumps(content, indent=2)}"
+    fill_in = f", with values of {', '.join(missing)} instead of null" if missing else ""
+    return (
+        f"The frames show the following; write it to {session.info_path}{fill_in}:\n{json.dumps(content, indent=2)}"
+    )
 
 
 def check_scale(session: Session, poses: PoseMethod, scale_known: bool) -> Finding:
-    """The finding ``scale``: whether anything gives the size of what is seen.
+    """The finding ``scale``: whether anything gives the scale.
 
     Args:
         session: the session.
@@ -176,7 +177,7 @@ def check_scale(session: Session, poses: PoseMethod, scale_known: bool) -> Findi
 
 
 def check_angles(session: Session, poses: PoseMethod, markers: Markers) -> list[Finding]:
-    """The finding ``angles`` where ``session.json`` states angles that cannot be used, or none that are needed."""
+    """The finding ``angles`` if those of ``session.json`` cannot be used, or are needed and missing."""
     needed = poses == "angles" or (poses == "auto" and markers.dictionary is None)
     try:
         angles_deg = known_angles_deg(session.info, len(session.frames))

@@ -20,14 +20,14 @@ FEWEST_TO_COMPARE = 3
 
 
 class Watch:
-    """A session's folder that is looked at again and again.
+    """Follows a session's folder while captures are added to it.
 
     Args:
         path: the session's folder; it may be empty.
 
     Attributes:
-        captures: number of captures that a line was given for.
-        flagged: those of them with something wrong.
+        captures: number of captures that were reported.
+        flagged: names of those with a fault.
         incomplete: why other captures cannot be read, by name.
     """
 

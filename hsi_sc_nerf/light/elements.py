@@ -1,4 +1,4 @@
-"""Elements: points that stand for a surface's parts, on the object and on what it stands on; which frames see them.
+"""Elements: points that represent parts of a surface, on the object and its support, and which frames see them.
 
 Lengths are metres in the object frame.
 """
@@ -25,14 +25,14 @@ SUPPORT_SIDES = 25
 POINTS_EACH = 4
 """Points of the object's surface for each of its elements; a pixel shows several times as many."""
 NORMAL_WEIGHT = 2.0
-"""A triangle belongs to the nearest element; a right angle between normals counts like so many spacings."""
+"""A triangle belongs to the nearest element; a right angle between normals counts as this many spacings."""
 LARGEST_INCIDENCE_DEG, LARGEST_INCIDENCE_OF_SUPPORT_DEG = 70.0, 80.0
-"""More oblique pixels also hold what lies beside. The lid is seen obliquely by every camera."""
+"""More oblique pixels also cover neighbouring parts. Every camera sees the lid obliquely."""
 
 SMALLEST = 1e-3
 """Reflectance that noise does not exceed."""
 MISPLACED_PX = 0.3
-"""Poses, surface and interpolation are uncertain by this part of a pixel."""
+"""Poses, surface and interpolation are uncertain by this fraction of a pixel."""
 
 Pixels = Callable[[int, Int[np.ndarray, "n"], Int[np.ndarray, "n"]], Float[np.ndarray, "n bands"]]
 """Reflectance of pixels of a frame, given by line and sample; NaN where nothing was measured."""
@@ -62,7 +62,7 @@ def spread_elements(scanned: Mesh, support: Mesh, on_object: int, on_support: in
 
     Args:
         scanned: the object's mesh, with or without holes.
-        support: what it stands on (`support_mesh`); may have no triangles.
+        support: the surface under the object (`support_mesh`); may have no triangles.
         on_object: elements of the object.
         on_support: elements of the support.
         smoothing_m: normals of the object are means over this radius: about a pixel, which shows no more.
@@ -87,12 +87,12 @@ def spread_elements(scanned: Mesh, support: Mesh, on_object: int, on_support: in
 def shown_points(
     elements: Elements, radius_m: float, lift_m: float
 ) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"], scipy.sparse.csr_array]:
-    """Points that pixels show of the elements: kernels of an ear shade each other and have normals of their own.
+    """Points of the elements that pixels show: kernels of an ear shade each other and have normals of their own.
 
     Args:
         elements: of the object and its support, which is smooth.
         radius_m: points lie within this of their element.
-        lift_m: lines of sight begin so far outside of the surface.
+        lift_m: distance of the origins of lines of sight from the surface.
 
     Returns:
         Points, outward unit normals, and the weight of each in each element as seen along its normal.
@@ -109,11 +109,11 @@ def shown_points(
     kept = elements.on_object[element] & (cosine > 0.0)
     shape = count, len(points)
     weights = scipy.sparse.csr_array((cosine[kept], (element[kept], point[kept])), shape=shape)
-    # What lies in a groove is hidden to one who looks along the mean normal of the elements around.
+    # A point in a groove is hidden from a viewer along the mean normal of the surrounding elements.
     scene = ray_scene(whole.vertices, whole.triangles)
     visible = unoccluded(scene, points + lift_m * normals, weights.T @ elements.normals)
     weights = weights @ scipy.sparse.diags_array(visible.astype(float))
-    # An element that is left without a point, and those of the support, stand for themselves.
+    # Elements without a point, and those of the support, represent themselves.
     alone = weights.sum(axis=1) <= 0.0
     weights = scipy.sparse.hstack([weights, scipy.sparse.diags_array(alone.astype(float))], format="csr")
     weights.eliminate_zeros()
@@ -183,9 +183,9 @@ def observe(
     pixels: Pixels,
     lift_m: float,
 ) -> Views:
-    """What frames measure of the elements that they see, interpolated between four pixels.
+    """Measurements of the visible elements in the frames, interpolated between four pixels.
 
-    All four pixels are the object's, or none is.
+    Either all four pixels belong to the object or none does.
 
     Args:
         elements: on the object and its support.
@@ -194,7 +194,7 @@ def observe(
         distortion: k1, k2, p1, p2 (OpenCV).
         masks: pixels of the object.
         pixels: reads reflectance.
-        lift_m: lines of sight begin so far outside of the surface.
+        lift_m: distance of the origins of lines of sight from the surface.
     """
     scene = ray_scene(elements.occluders.vertices, elements.occluders.triangles)
     starts = elements.positions + lift_m * elements.normals

@@ -1,4 +1,4 @@
-"""Light that stands still in the camera's frame: an uneven chamber and lamps, as functions of direction.
+"""Light that is stationary in the camera's frame: an uneven chamber and lamps, as functions of direction.
 
     radiance(direction, band) = chamber(direction) * chamber_colour(band) + lamps(direction) * lamp_colour(band)
 
@@ -22,7 +22,7 @@ TERMS = (DEGREE + 1) ** 2
 FINE_DIRECTIONS = 1 << 13
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 LOBE_WIDTH_RAD = 0.08
-"""Standard deviation of a lobe: that of a lamp of 25 cm at 1 m, and no lobe falls between the directions of rays."""
+"""Standard deviation of a lobe: that of a lamp of 25 cm at 1 m, and wide enough for the directions of the rays."""
 
 
 @dataclass(frozen=True, eq=False)

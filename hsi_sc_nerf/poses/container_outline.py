@@ -30,8 +30,8 @@ _HEIGHTS = np.linspace(0.15, 0.7, 24)
 _AZIMUTHS = np.deg2rad(np.linspace(-60.0, 60.0, 24))
 # From one tried radius or height to the next, and standard deviation of the Gaussian over them.
 _STEP_PX, _SMOOTHING_PX = 0.2, 0.7
-# An edge changes the brightness by this from one pixel to the next, gray levels, but for so many points in a hundred;
-# frames agree to this fraction of the radius.
+# Least slope of the brightness at an edge, gray levels per pixel, and the percentage of its points that may have
+# less; and largest spread of the frames' results, as a fraction of the radius.
 _LEAST_SLOPE, _WEAKEST_PERCENTILE = 2.0, 20.0
 _LARGEST_SPREAD = 0.02
 _ROUNDS = 3
@@ -144,10 +144,10 @@ def _arcs(radius: float, feet: Float[np.ndarray, "z"]) -> Float[np.ndarray, "1 a
 def _slopes(
     image: Float[np.ndarray, "h w"], turntable: Turntable, points: Float[np.ndarray, "k points n 3"]
 ) -> Float[np.ndarray, "k n"]:
-    """How much the brightness changes from pixel to pixel across each of n lines, at least at most of its points.
+    """Slope of the brightness across each of n lines, which most of its points reach; 0 outside of the image.
 
-    An edge of the container goes all along its height, before the disc and before the wall; patterns of the wall do
-    not. 0 outside of the image.
+    An edge of the container extends over its whole height, in front of the disc and of the wall. Patterns on the wall
+    do not.
     """
     in_camera = (points - [turntable.distance, 0.0, 0.0]) @ turntable.camera_rotation.T
     pixels = turntable.focal_px * in_camera[..., :2] / in_camera[..., 2:] + turntable.centre_px

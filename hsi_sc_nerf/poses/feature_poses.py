@@ -42,10 +42,10 @@ _FOCAL_SIGMA = 0.002
 _LEAST_ANGLE_SIGMA_RAD = 1e-3
 """Least standard deviation of a turntable's known angles."""
 _SIGMAS, _LEAST_TILT_DEG, _LEAST_ZOOM = 3.0, 0.3, 0.02
-"""An earlier camera is contradicted beyond so many standard deviations, and this tilt of the axis or this fraction of
-the focal length."""
+"""The features contradict an earlier camera from this many standard deviations, and this tilt of the axis or this
+fraction of the focal length."""
 MOST_CONTRADICTING = 1 / 3
-"""Largest fraction of COLMAP's poses that may contradict one turntable: of more it is not known which are right."""
+"""Largest fraction of COLMAP's poses that may contradict one turntable: with more, the right ones are not known."""
 
 Images = Sequence[UInt8[np.ndarray, "h w"]]
 """One image per frame, or ``SessionPictures``."""
@@ -99,7 +99,7 @@ def known_angles_deg(info: SessionInfo, frames: int) -> Float[np.ndarray, "n"] |
 def poses_from_known_camera(
     names: Sequence[str], size_px: tuple[int, int], info: SessionInfo, camera: KnownCamera
 ) -> TurntablePoses:
-    """Poses of a camera that has not moved since an earlier session, from angles alone: nothing is measured.
+    """Poses of a camera that has not moved since an earlier session, from known angles alone, without measurement.
 
     Args:
         size_px: width and height of the images.
@@ -107,8 +107,8 @@ def poses_from_known_camera(
         camera: of the earlier session; its direction counts where ``info`` has none.
 
     Raises:
-        InputError: images of another size than the camera's, unknown angles, or an unknown direction, with which the
-            poses would be mirrored as likely as not.
+        InputError: images of another size than the camera's, unknown angles, or an unknown direction: the poses might
+            be mirrored.
     """
     camera.check_size(size_px)
     direction, n = info.direction or camera.direction, len(names)
@@ -117,8 +117,8 @@ def poses_from_known_camera(
         raise InputError("the angles are not known; give nominal_step_deg or frame_angles_deg in session.json")
     if direction is None:
         raise InputError(
-            "which way the turntable turns is not known, nor do the angles of the earlier session tell; give "
-            "direction (ccw or cw) in session.json"
+            "which way the turntable turns is not known, neither from session.json nor from the angles of the "
+            "earlier session; give direction (ccw or cw) in session.json"
         )
     if info.direction is None and direction == "cw":
         angles_deg = -angles_deg

@@ -64,8 +64,8 @@ def marker_pattern(dictionary: str, marker: int) -> UInt8[np.ndarray, "cells cel
 def detect_markers(image: UInt8[np.ndarray, "h w"], dictionary: str) -> Detections:
     """Markers seen at any of several magnifications of the image.
 
-    Their corners are good to about half a pixel, and some markers are misread: ``fit_marker`` refines the ones and
-    rejects the others.
+    Their corners are good to about half a pixel, which ``fit_marker`` refines. Some markers are misread, which it
+    rejects.
     """
     detector = _detector(dictionary)
     found: Detections = {}
@@ -87,7 +87,7 @@ def detect_markers(image: UInt8[np.ndarray, "h w"], dictionary: str) -> Detectio
 def find_dictionary(images: Sequence[UInt8[np.ndarray, "h w"]]) -> str | None:
     """The dictionary whose markers are seen most often in a few of the frames; None if there are none.
 
-    Of a family the smallest dictionary that holds the ids is taken: it tolerates the most misread cells. Where the
+    The smallest dictionary of a family that holds the ids is taken: it tolerates the most misread cells. If the
     frames' best pictures show no marker, the broad mean is searched too: sharp edges need not be those of ink.
     """
     session = SessionPictures.of(images)

@@ -1,7 +1,7 @@
 """Are the pixels square? A line scanner whose speed does not fit its frame rate makes them longer or shorter.
 
-The images of square markers that turn tell the pixels' shape: with their lines moved closer or further apart, one
-spacing explains the corners best.
+Images of square markers in many orientations determine the pixels' shape: the images' lines are moved closer together
+or further apart until the turntable fits the corners best.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ _STEP, _ROUNDS = 0.02, 3
 
 
 def pixel_aspect(adjusted: Adjusted, observations: MarkerObservations) -> tuple[float, float]:
-    """Height of a pixel over its width by the markers, and how strongly they call for it.
+    """Height of a pixel over its width by the markers, and the evidence that pixels are not square.
 
     Args:
         adjusted: the turntable of square pixels.
         observations: the corners that it was adjusted to.
 
     Returns:
-        The ratio, and -log10 of the probability that chance alone lowers the squares as much.
+        The ratio, and -log10 of the p-value for square pixels.
 
     Example:
         >>> adjusted, kept, _ = adjust_without_outliers(start, observations)
@@ -61,7 +61,7 @@ def pixel_aspect(adjusted: Adjusted, observations: MarkerObservations) -> tuple[
 
 
 def stretched(observations: MarkerObservations, factor: float, centre_px: float) -> MarkerObservations:
-    """The corners with the images' lines further apart by a factor, from the line of the principal point on."""
+    """The corners with the images' lines further apart by a factor; the line of the principal point is fixed."""
     scale, centre = np.array([1.0, factor]), np.array([0.0, centre_px])
     both = np.tile(scale, 4)
     return replace(

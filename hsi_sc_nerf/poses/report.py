@@ -41,7 +41,7 @@ _TITLE_CHARACTERS = 190
 
 
 def check_poses(poses: TurntablePoses, info: SessionInfo) -> list[Finding]:
-    """What speaks for and against the poses.
+    """Check the poses against each other and against what is known of the session.
 
     Args:
         poses: of the session.
@@ -148,7 +148,7 @@ def _check_scale(poses: TurntablePoses) -> list[Finding]:
         if abs(side - 1.0) > max(_ODD_SIDE, _ODD_SIDE_SIGMAS * scale.marker_side_sigmas[marker]):
             sentence = (
                 f"Marker {marker} seems {100.0 * abs(side - 1.0):.1f} % {'larger' if side > 1.0 else 'smaller'} than "
-                "the others; all must have one side."
+                "the others; all must have the same side."
             )
             found.append(Finding("poses-markers", "amber", sentence, {"marker": marker, "relative_side": side}))
     return found
@@ -181,7 +181,7 @@ def _left_out(poses: TurntablePoses) -> str:
 
 
 def pose_report(poses: TurntablePoses, info: SessionInfo, findings: Sequence[Finding] = ()) -> dict:
-    """Figures of an estimate and what was found in it; numbers that are unknown are None."""
+    """Figures and findings of an estimate; unknown numbers are None."""
     steps = np.diff(poses.angles_deg[poses.used])
     full_turn = is_full_turn(poses.angles_deg[poses.used])
     # The mean axis in the camera's axes: right, up, backwards.

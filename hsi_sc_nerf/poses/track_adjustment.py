@@ -23,7 +23,7 @@ from hsi_sc_nerf.poses.turntable_from_poses import reversed_in_depth
 # Residuals well above this count by their length, not its square, pixels. Small, because features that are no point
 # of the object, such as an outline or the shadow side of a bump, creep over it slowly.
 _LOSS_PX = 0.1
-# Far from the solution a small loss scale holds on to what fits by chance.
+# Far from the solution, a small loss scale would keep what fits by chance.
 _FIRST_LOSS_PX = 1.0
 _SMALLEST_GAIN = 1e-6
 # Outliers are farther than this many standard deviations, measured on the residuals, and than this, pixels.
@@ -140,7 +140,7 @@ def _adjusted(turntable: Turntable, kept: Tracks, loss_px: float, free_angles: b
 def adjust_together(
     found: AdjustedTracks, markers: MarkerObservations | None, free: FreeParameters
 ) -> tuple[Adjusted, MarkerObservations | None]:
-    """Adjust tracks, the markers that are seen, and prior knowledge together, with a covariance that can be believed.
+    """Adjust tracks, the visible markers, and prior knowledge together, with a realistic covariance.
 
     Args:
         found: the turntable adjusted to the tracks alone.

@@ -104,8 +104,8 @@ def turntable_from_poses(
 def reversed_in_depth(turntable: Turntable) -> Turntable:
     """The turntable whose points, axis and turn are mirrored in depth: a camera far away sees the same of it.
 
-    A long lens hardly tells a turn one way, seen from above, from a turn the other way, seen from below. Structure
-    from motion with a wrong focal length may find the wrong one of the two.
+    With a long lens, a turn in one direction seen from above looks nearly like a turn in the other direction seen
+    from below. Structure from motion with a wrong focal length may find the wrong one of the two.
 
     Args:
         turntable: without markers and motions.

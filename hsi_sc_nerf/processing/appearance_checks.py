@@ -24,36 +24,37 @@ from hsi_sc_nerf.poses.turntable import rotations_about_z
 from hsi_sc_nerf.processing.view_changes import PointViews, facing_cell, mean_by_index
 
 LEVEL_AMBER, LEVEL_RED = 0.04, 0.15
-"""Departures of a frame's brightness (logarithm) from the other frames'. Frames of good sessions stay below 0.01."""
+"""Deviation of a frame's brightness (logarithm) from the other frames. It is below 0.01 in good sessions."""
 PATCH_AMBER, PATCH_RED, PATCH_TIMES = 0.06, 0.2, 3.0
-"""The same of its parts (root mean square over directions), which also have to exceed the typical frame's by a
-factor: noise and a rough hull leave up to 0.03."""
+"""The same for parts of a frame (root mean square over directions). It must also exceed that of a typical frame by a
+factor: noise and a rough hull cause up to 0.03."""
 LEAST_IN_PATCH = 15
 """Fewest points of a part."""
 FEW = 0.1
-"""Fraction of the frames up to which those that are lit otherwise can be left out."""
+"""Up to this fraction of the frames, those with different light are to be left out."""
 FEWEST_FRAMES, FEWEST_POINTS = 6, 200
-"""Fewest frames that tell of one, and fewest points that two frames share."""
+"""Fewest frames with which one can be compared, and fewest points that two frames must share."""
 SLIPS_DEG = np.arange(-30.0, 30.1, 1.5)
 """Turns of the object on the disc that are tried."""
 LEAST_SLIP_DEG, SLIP_FIT = 3.0, 0.65
-"""Two frames fit each other better with a slip if that leaves less than this fraction of their difference. Good
-sessions have 0.75 or more: of a plain object, another part may look alike by chance."""
+"""Least angle of a slip, and the fraction of two frames' difference that may remain with it. Good sessions have 0.75
+or more: another part of a plain object may look the same by chance."""
 MOST_SLIPS, ONE_DIRECTION = 0.5, 0.8
-"""Where more of the pairs slip, nearly all in one direction, reflections stand still on a smooth object."""
+"""If more of the pairs seem to slip, nearly all in one direction, the object is smooth and reflections are
+stationary."""
 MATCHED_M = 0.003
 """Largest distance of points that are compared."""
 LARGEST_SIGMAS = 3.0
-"""Differences count up to this many standard deviations: highlights move otherwise."""
+"""Differences are limited to this many standard deviations: highlights do not move with the object."""
 LEAST_SCATTER = 0.003
 """Scatter of a channel (logarithm) that is stated at least."""
 _ROUNDS = 12
 BLUE_NM, INFRARED_NM = (430.0, 500.0), (850.0, 970.0)
-"""Of the 400 to 1000 nm of silicon, one is about the other's mirror image."""
+"""Within 400 to 1000 nm, the range of silicon, each is about the mirror image of the other."""
 ORDER_AMBER, ORDER_RED = 1.3, 2.0
-"""Reflectance in the blue over that in the infrared. White and grey things have 1, tissue less."""
+"""Reflectance in the blue over that in the infrared; 1 for white and grey things, less for tissue."""
 LEAST_BLUE = 0.1
-"""Of darker things noise and stray light may decide."""
+"""In darker objects, noise and stray light may exceed the reflectance."""
 
 
 def check_appearance(views: PointViews, names: Sequence[str]) -> list[Finding]:
@@ -70,13 +71,13 @@ def check_appearance(views: PointViews, names: Sequence[str]) -> list[Finding]:
         return []
     looks = without_standing_light(views)
     light = _frames_light(views, looks, names)
-    # A frame in shade fits no other one, with any slip.
+    # A frame in shade matches no other frame, whatever the slip.
     shaded = {name for finding in light if finding.level == "red" for name in finding.values}
     return [*light, *_frames_slip(views, looks, names, shaded)]
 
 
 def without_standing_light(views: PointViews) -> Float[np.ndarray, "n channels"]:
-    """Logarithm of each view's brightness, and of its colours over it, less what goes with the direction it faces."""
+    """Logarithm of each view's brightness and of its colours over it, without what its direction explains."""
     log = np.log(np.maximum(views.reflectance, 1e-3))
     brightness = log.mean(axis=1, keepdims=True)
     channels = np.concatenate([brightness, log - brightness], axis=1)
@@ -110,7 +111,7 @@ def _frames_light(views: PointViews, looks: Float[np.ndarray, "n channels"], nam
     changes = {names[numbers[row]]: round(float(max(level[row], patches[row])), 4) for row in named}
     percent = 100.0 * -np.expm1(-max(changes.values()))
     sentence = (
-        f"The object is lit otherwise in {names_in_short([*changes])} than in the other frames, by up to "
+        f"The light on the object in {names_in_short([*changes])} differs from that in the other frames by up to "
         f"{percent:.0f} %: a shadow fell on it, or a lamp changed or moved"
     )
     few = len(named) < FEW * len(numbers)
@@ -136,10 +137,10 @@ def _frames_slip(
     directions = np.sign([*slipped.values()])
     if not slipped or (len(slipped) > MOST_SLIPS * len(pairs) and abs(directions.mean()) > ONE_DIRECTION):
         return []
-    told = ", ".join(f"{pair} (by about {abs(deg):.0f} degrees)" for pair, deg in list(slipped.items())[:3])
+    slips = ", ".join(f"{pair} (by about {abs(deg):.0f} degrees)" for pair, deg in list(slipped.items())[:3])
     sentence = (
-        f"The object turned on the disc from {told}: its texture moved otherwise than the markers; fix it and take "
-        "the session again, or leave out the frames before or after with --exclude."
+        f"The object slipped on the disc from {slips}: its texture moved differently from the markers; fasten it and "
+        "take the session again, or leave out the frames before or after with --exclude."
     )
     return [Finding("frames-slip", "red", sentence, {"slip_deg": slipped})]
 

@@ -24,7 +24,7 @@ MAX_ODDITY, ODDITY_SIGMAS = 0.015, 5.0
 """Largest excess of one frame's difference over the typical one, to which an eighth of a pixel is added; and the same
 in standard deviations of the frames' differences, for noise frays masks."""
 BACKGROUND_SIGMAS = 3.0
-"""Departure from what other frames show in a pixel, in standard deviations of theirs, up to which it is the same."""
+"""A pixel shows the same as in the other frames up to this deviation, in their standard deviations."""
 STILL_OVERLAP = 0.97
 """Intersection over union of all masks from which they stand still."""
 STILL_FRACTION = 0.7
@@ -41,7 +41,7 @@ def check_masks(
     regions: Bool[np.ndarray, "frames h w"] | None = None,
     lid_middles: Bool[np.ndarray, "frames h w"] | None = None,
 ) -> list[Finding]:
-    """What speaks against the masks; nothing for good ones.
+    """Findings on the masks; none for good ones.
 
     Args:
         silhouettes: of the masks' visual hull (`VotedHull`).
@@ -102,9 +102,10 @@ def _still(
     brightness: Float[np.ndarray, "frames h w"],
     lid_middles: Bool[np.ndarray, "n h w"] | None,
 ) -> list[Finding]:
-    """Masks that are the same in all frames and show the same at their edge: of what does not turn.
+    """Masks that are the same in all frames and show the same at their edge: they are of something stationary.
 
-    A body of revolution looks like that as well. It stands on the lid and hides its middle; a wall is behind the lid.
+    A body of revolution has such masks as well, but it stands on the lid and hides its middle. A wall is behind the
+    lid.
     """
     if lid_middles is not None and (masks & lid_middles).sum() > STANDING_FRACTION * lid_middles.sum():
         return []

@@ -30,7 +30,7 @@ _FIRST_STEP = 6
 GRID_CELLS = 48
 """The visual hull is computed on this number of voxels along each axis."""
 HULL_MISSED_FRACTION = 0.15
-"""Frames that may contradict a point of the hull: a few frames of another object must not carve it."""
+"""Fraction of the frames that may contradict a point: a few frames of another object must not carve the hull."""
 OBJECT_MARGIN_M = 0.003
 """The object's box is widened by this: masks and poses are uncertain by a pixel or two."""
 SCENE_MARGIN_M = 0.005
@@ -230,13 +230,13 @@ def scene_box(
 
 
 def assumed_disc(has_markers: bool, container_diameter_m: float | None) -> str | None:
-    """What `scene_box` assumes of a disc that no marker shows, as the rest of a sentence; None with markers."""
+    """What `scene_box` assumes about a disc that no marker shows, as the rest of a sentence; None with markers."""
     if has_markers:
         return None
     if container_diameter_m is None:
-        return "nothing shows how far the disc reaches: what turns is taken to end where the masks' hull ends"
+        return "the size of the disc is not known: the scene is taken to end where the masks' hull ends"
     diameter_mm = 1e3 * DISC_OVER_CONTAINER * container_diameter_m
     return (
-        f"no marker shows how far the disc reaches: its diameter is taken to be {diameter_mm:.0f} mm, "
+        f"no marker shows the size of the disc: its diameter is taken to be {diameter_mm:.0f} mm, "
         f"{DISC_OVER_CONTAINER} times the container's"
     )

@@ -109,7 +109,7 @@ def views_of_path(path: Path) -> Views:
 
 @dataclass(frozen=True, eq=False)
 class RenderedView:
-    """What the model shows from one camera.
+    """The model's image from one camera.
 
     Attributes:
         spectral: reflectance; transparent pixels include the background's.

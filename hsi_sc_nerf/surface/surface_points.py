@@ -46,7 +46,7 @@ than the part of the surface that a cell of the depth maps covers either."""
 TRUNCATION_VOXELS = 4
 """Signed distances are truncated at this many voxels from the surface."""
 NORMAL_VERTICES = 8
-"""Normals are means over this many vertices: those of one vertex are as rough as the voxels."""
+"""Number of vertices over which normals are averaged: the normal of one vertex is as rough as the voxels."""
 
 
 @dataclass(eq=False)
@@ -182,7 +182,7 @@ def surface_mesh(
     points_per_batch: int,
     touching_opacity: float = 0.5,
 ) -> SurfaceMesh | None:
-    """The fused mesh with its vertices moved to the model's silhouettes, without triangles that are no surface of it.
+    """The fused mesh with its vertices moved to the model's silhouettes, without triangles off the model's surface.
 
     Args:
         model: trained model, in evaluation mode.
@@ -202,7 +202,7 @@ def surface_mesh(
     floor = float(box[0][2])
 
     def density_fn(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 1"]:
-        # Rays that touch the object's base would end in what it stands on.
+        # Rays that touch the object's base would end in its support.
         return rendered_density(model, points) * (points[..., 2:] >= floor)
 
     with progress_bar("finding the surface", "points", len(vertices)) as update:
