@@ -28,7 +28,7 @@ LIT_AMBER, LIT_RED = 0.002, 0.01
 covered lens."""
 CERTAINTY = 3.0
 """Light is reported from this many standard deviations: with few bands, a dark pattern may resemble a lamp."""
-OTHER_TIME = 1.01
+DIFFERENT_TIME = 1.01
 """Integration times differ if their ratio exceeds this."""
 LINE_AMBER, LINE_RED = 0.03, 0.1
 """Height of a line over the reflectance beside it, as a fraction. Good sessions have less than 0.005."""
@@ -57,7 +57,7 @@ class _Exposure:
         dark_ms = None if self.dark is None else self.dark.integration_time_ms
         if dark_ms is None or self.counts_ms is None:
             return False
-        return max(dark_ms, self.counts_ms) > OTHER_TIME * min(dark_ms, self.counts_ms)
+        return max(dark_ms, self.counts_ms) > DIFFERENT_TIME * min(dark_ms, self.counts_ms)
 
 
 def check_dark(

@@ -25,7 +25,7 @@ TOLERANCE = 0.002
 change by the same factor everywhere, and a bin's bands have other weights in every pixel."""
 SCATTERS = (0.0, 0.01, 0.02, 0.04, 0.08)
 """Scatters of the grey level that are tried, ascending (relative)."""
-MORE = 1.4
+CLEARLY_MORE = 1.4
 """A larger scatter is taken if it makes more than this many times as many pixels static."""
 SCATTER_OF_COLOUR = 0.2
 """Scatter of the colour relative to that of the grey level."""
@@ -135,7 +135,7 @@ def static_pixels(courses: Courses) -> tuple[Bool[np.ndarray, "pixels"], Float[n
     for scatter in SCATTERS:
         static, common = _static_with_scatter(courses, scatter)
         fraction = MIN_SCATTERING_FRACTION if scatter > 0.0 else MIN_FRACTION
-        if static.sum() >= max(MIN_PIXELS, fraction * len(static), MORE * best.sum()):
+        if static.sum() >= max(MIN_PIXELS, fraction * len(static), CLEARLY_MORE * best.sum()):
             best, course = static, common
         elif best.any():
             break

@@ -195,9 +195,9 @@ def deviations(pictures: Sequence[Float[np.ndarray, "h w channels"]]) -> Float[n
     small = np.clip(np.stack(resized), 0.0, 1.5)
     brightness = np.median(small / np.maximum(np.median(small, axis=0), 0.02), axis=(1, 2, 3), keepdims=True)
     small /= np.maximum(brightness, 1e-3)
-    away = np.abs(small - np.median(small, axis=0))
+    difference = np.abs(small - np.median(small, axis=0))
     spread = np.maximum(median_abs_deviation(small, scale="normal"), LEAST_SPREAD)
-    deviation = np.minimum(away / spread, LARGEST_DEVIATION).mean(axis=(1, 2, 3))
+    deviation = np.minimum(difference / spread, LARGEST_DEVIATION).mean(axis=(1, 2, 3))
     return deviation / max(float(np.median(deviation)), 1e-12)
 
 

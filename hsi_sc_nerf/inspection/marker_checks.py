@@ -262,9 +262,9 @@ def turn_and_rotation_deg(
     angles_deg = turntable.over_session(turntable.relative_angles_deg(), len(detections))
     if np.nanmax(angles_deg) - np.nanmin(angles_deg) < LEAST_TURN_DEG:
         return unknown, None
-    right, down, away = turntable.camera_rotation[:, 2]
+    right, down, forward = turntable.camera_rotation[:, 2]
     roll_deg = np.rad2deg(np.arctan2(-down, right)) - 90.0
     nearest = 90 * round(roll_deg / 90.0)
-    looks_down = LOOKS_DOWN_DEG[0] < np.rad2deg(np.arcsin(np.clip(-away, -1.0, 1.0))) < LOOKS_DOWN_DEG[1]
+    looks_down = LOOKS_DOWN_DEG[0] < np.rad2deg(np.arcsin(np.clip(-forward, -1.0, 1.0))) < LOOKS_DOWN_DEG[1]
     is_clear = looks_down and abs(roll_deg - nearest) <= LARGEST_ROLL_DEG
     return angles_deg, nearest % 360 if is_clear else None

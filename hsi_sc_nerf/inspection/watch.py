@@ -39,7 +39,7 @@ class Watch:
         self._seen: set[str] = set()
         self._quicklooks: list[Quicklook] = []
         self._markers: list[int] = []
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self._info = SessionInfo()
         self._first: Capture | None = None
         self._dictionary: str | None = None
@@ -75,10 +75,10 @@ class Watch:
         return lines
 
     def _once(self, line: str) -> list[str]:
-        """The line, unless it was told before."""
-        told = line in self._told
-        self._told.add(line)
-        return [] if told else [line]
+        """The line, unless it was reported before."""
+        reported = line in self._reported
+        self._reported.add(line)
+        return [] if reported else [line]
 
     def _is_complete(self, files: CaptureFiles) -> bool:
         """Whether the dark cube, which a SPECIM IQ writes beside the counts, is there if earlier captures had one."""

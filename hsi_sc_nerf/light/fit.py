@@ -20,15 +20,15 @@ from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.geometry.camera import unit_vectors
 from hsi_sc_nerf.light.shared_errors import CORRELATED, SMALLEST_SCATTER, SharedErrors, scatter_beyond, tukey_weights
-from hsi_sc_nerf.light.standing_light import (
+from hsi_sc_nerf.light.stationary_light import (
     DEGREE,
     TERMS,
-    StandingLight,
+    StationaryLight,
     even_directions,
     even_light,
     harmonic_degrees,
     tangents,
-    units_on,
+    unit_irradiance,
 )
 from hsi_sc_nerf.light.views import LampUnits, TurningElements, Views
 from hsi_sc_nerf.robust_scatter import robust_std
@@ -85,7 +85,7 @@ class LightFit:
         relative_std: relative standard deviation of each measurement's irradiance due to the light's uncertainty.
     """
 
-    light: StandingLight
+    light: StationaryLight
     material: Float[np.ndarray, "n bands"]
     weights: Float[np.ndarray, "m"]
     irradiance: Float[np.ndarray, "m bands"]
@@ -290,7 +290,7 @@ class _Fit:
         now[:TERMS], now[TERMS : TERMS + lamps] = light.chamber, light.lamps
         if lamps:
             now[-1] = light.nearness
-        of_chamber, of_lamps = units_on(self.white, light.to_lamps)
+        of_chamber, of_lamps = unit_irradiance(self.white, light.to_lamps)
         white = np.zeros(len(precision))
         white[:TERMS], white[TERMS : TERMS + lamps] = of_chamber, of_lamps
         missing = 1.0 - of_chamber @ light.chamber - of_lamps @ light.lamps
@@ -314,7 +314,7 @@ class _Fit:
             )
         )
 
-    def _set(self, light: StandingLight) -> None:
+    def _set(self, light: StationaryLight) -> None:
         if not np.array_equal(light.to_lamps, self.light.to_lamps):
             self.lamps = self.elements.lamps_at(self.views, light.to_lamps)
         self.light = light

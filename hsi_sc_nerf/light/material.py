@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.light.elements import NORMAL_WEIGHT, Elements, shown_points
 from hsi_sc_nerf.light.fit import LEAST_IRRADIANCE, OCCLUSION_ERROR, LightFit, fit_light
-from hsi_sc_nerf.light.standing_light import even_directions
+from hsi_sc_nerf.light.stationary_light import even_directions
 from hsi_sc_nerf.light.views import TurningElements, Views, transfer
 
 RAY_DIRECTIONS = 2048

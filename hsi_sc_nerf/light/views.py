@@ -10,7 +10,7 @@ import scipy.sparse
 from jaxtyping import Bool, Float, Int
 
 from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene
-from hsi_sc_nerf.light.standing_light import DEGREE, LOBE_WIDTH_RAD, StandingLight, harmonics, lobes, tangents
+from hsi_sc_nerf.light.stationary_light import DEGREE, LOBE_WIDTH_RAD, StationaryLight, harmonics, lobes, tangents
 
 RAYS_AT_ONCE = 1 << 21
 BOUNCES = 4
@@ -144,7 +144,7 @@ class TurningElements:
     directions: Float[np.ndarray, "directions 3"]
     rotations: Float[np.ndarray, "frames 3 3"]
 
-    def direct(self, light: StandingLight, frame: int) -> Float[np.ndarray, "n bands"]:
+    def direct(self, light: StationaryLight, frame: int) -> Float[np.ndarray, "n bands"]:
         """Irradiance of all elements in a frame by chamber and lamps alone."""
         weights, to_lamps = self.transfer.open_weights, light.to_lamps @ self.rotations[frame].T
         chamber = weights @ (self._harmonics[frame] @ light.chamber).astype(np.float32)
@@ -153,7 +153,7 @@ class TurningElements:
         return chamber[:, None] * light.chamber_colour + (lamps @ light.lamps)[:, None] * light.lamp_colour
 
     def bounced(
-        self, light: StandingLight, material: Float[np.ndarray, "n bands"], frame: int
+        self, light: StationaryLight, material: Float[np.ndarray, "n bands"], frame: int
     ) -> Float[np.ndarray, "n bands"]:
         """Irradiance of all elements in a frame by each other, after up to `BOUNCES` diffuse reflections."""
         direct = self.direct(light, frame).astype(np.float32)

@@ -198,8 +198,8 @@ def prior_of_angles(turntable: Turntable, known_rad: Float[np.ndarray, "n"]) -> 
     """
     known, found = known_rad[turntable.frames], turntable.angles_rad
     known = np.copysign(1.0, np.dot(np.diff(known), np.diff(found))) * known
-    away = found - found.mean() - known + known.mean()
-    return known - known[0] + found[0], max(float(np.sqrt((away**2).mean())), _LEAST_ANGLE_SIGMA_RAD)
+    deviation_rad = found - found.mean() - known + known.mean()
+    return known - known[0] + found[0], max(float(np.sqrt((deviation_rad**2).mean())), _LEAST_ANGLE_SIGMA_RAD)
 
 
 def _posed(

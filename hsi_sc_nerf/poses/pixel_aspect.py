@@ -73,12 +73,12 @@ def stretched(observations: MarkerObservations, factor: float, centre_px: float)
 
 def check_pixel_aspect(aspect: float, evidence: float) -> list[Finding]:
     """The finding ``poses-aspect`` where pixels are not square (`pixel_aspect`)."""
-    away = abs(aspect - 1.0)
-    if evidence <= EVIDENCE_NEEDED or away <= ASPECT_AMBER:
+    departure = abs(aspect - 1.0)
+    if evidence <= EVIDENCE_NEEDED or departure <= ASPECT_AMBER:
         return []
-    level: Level = "red" if away > ASPECT_RED else "amber"
+    level: Level = "red" if departure > ASPECT_RED else "amber"
     sentence = (
-        f"The pixels are {100.0 * away:.1f} % {'higher' if aspect > 1.0 else 'lower'} than wide by the markers: "
+        f"The pixels are {100.0 * departure:.1f} % {'higher' if aspect > 1.0 else 'lower'} than wide by the markers: "
         "match the scanner's speed to its frame rate, or resample the cubes to square pixels."
     )
     return [Finding("poses-aspect", level, sentence, {"height_over_width": aspect, "evidence": evidence})]

@@ -75,8 +75,8 @@ def step_deviation_deg(poses: TurntablePoses, info: SessionInfo) -> float | None
     index = np.flatnonzero(poses.used)
     angles = poses.angles_deg[poses.used]
     step = np.copysign(info.nominal_step_deg, np.median(np.diff(angles)))
-    away = angles - step * (index - index[0])
-    return float(np.abs((away + 180.0) % 360.0 - 180.0).max())
+    deviation_deg = angles - step * (index - index[0])
+    return float(np.abs((deviation_deg + 180.0) % 360.0 - 180.0).max())
 
 
 def _check_uncertainty(poses: TurntablePoses) -> list[Finding]:
@@ -105,12 +105,13 @@ def _check_angles(poses: TurntablePoses, info: SessionInfo) -> list[Finding]:
         found.append(Finding("poses-direction", "red", sentence, {"given": info.direction, "found": direction}))
     if info.frame_angles_deg is not None and len(info.frame_angles_deg) == len(poses.used):
         given = np.copysign(1.0, median) * np.abs(np.array(info.frame_angles_deg) - info.frame_angles_deg[0])
-        away = (poses.angles_deg - given)[poses.used]
-        away = np.abs((away - np.median(away) + 180.0) % 360.0 - 180.0)
-        if away.max() > _ANGLE_DEG:
-            level: Level = "red" if np.median(away) > _ANGLE_DEG else "amber"
-            sentence = f"Angles depart from frame_angles_deg by {np.median(away):.1f} to {away.max():.1f} degrees."
-            found.append(Finding("poses-angles", level, sentence, {"largest_deviation_deg": float(away.max())}))
+        difference_deg = (poses.angles_deg - given)[poses.used]
+        difference_deg = np.abs((difference_deg - np.median(difference_deg) + 180.0) % 360.0 - 180.0)
+        typical, largest = float(np.median(difference_deg)), float(difference_deg.max())
+        if largest > _ANGLE_DEG:
+            level: Level = "red" if typical > _ANGLE_DEG else "amber"
+            sentence = f"Angles depart from frame_angles_deg by {typical:.1f} to {largest:.1f} degrees."
+            found.append(Finding("poses-angles", level, sentence, {"largest_deviation_deg": largest}))
         return found
     nominal, deviation = info.nominal_step_deg, step_deviation_deg(poses, info)
     if nominal is None or deviation is None:

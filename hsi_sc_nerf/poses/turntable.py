@@ -200,8 +200,8 @@ class Turntable:
 
     def errors_px(self, seen: MarkerObservations | Tracks) -> Float[np.ndarray, "n"]:
         """Distance of each observation from its projection; of a marker the root mean square over its corners."""
-        away = self.reproject(seen) - self._landmarks(seen)[3]
-        return np.sqrt((away**2).sum(axis=-1).reshape(len(seen), -1).mean(axis=-1))
+        difference = self.reproject(seen) - self._landmarks(seen)[3]
+        return np.sqrt((difference**2).sum(axis=-1).reshape(len(seen), -1).mean(axis=-1))
 
     def frame_errors_px(self, seen: MarkerObservations | Tracks, size: int) -> tuple[Float[np.ndarray, "n"], float]:
         """Root mean square error in each of the session's ``size`` frames, nan without observations; and in all."""

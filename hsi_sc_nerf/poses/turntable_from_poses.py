@@ -117,7 +117,7 @@ def reversed_in_depth(turntable: Turntable) -> Turntable:
     rotation = (np.eye(3) - 2.0 * np.outer(sight, sight)) @ turntable.camera_rotation @ mirror
     camera = -rotation.T @ in_camera
     turn = rotation_about_z(float(np.rad2deg(np.arctan2(camera[1], camera[0]))))[:3, :3]
-    away = replace(
+    mirrored = replace(
         turntable,
         camera_rotation=rotation @ turn,
         distance=float(np.hypot(camera[0], camera[1])),
@@ -125,7 +125,7 @@ def reversed_in_depth(turntable: Turntable) -> Turntable:
         # The origin is at the camera's height.
         points_3d=(turntable.points_3d - middle) @ mirror @ turn - [0.0, 0.0, camera[2]],
     )
-    return away.resized(turntable.distance / away.distance)
+    return mirrored.resized(turntable.distance / mirrored.distance)
 
 
 def _agreeing(rotations):
@@ -141,8 +141,8 @@ def _agreeing(rotations):
         return np.zeros(len(rotations), bool)
     axes = relative[turned] / size[turned, None]
     in_camera = np.einsum("pij,pj->pi", rotations[i[turned]], axes)
-    away = np.linalg.norm(np.einsum("nij,pj->pni", rotations, axes) - in_camera[:, None], axis=-1)
-    best = away[np.argmin(np.median(away, axis=1))]
+    misfit = np.linalg.norm(np.einsum("nij,pj->pni", rotations, axes) - in_camera[:, None], axis=-1)
+    best = misfit[np.argmin(np.median(misfit, axis=1))]
     return best <= max(np.deg2rad(_CONTRADICTS_DEG), _CONTRADICTS_MEDIANS * float(np.median(best)))
 
 

@@ -69,14 +69,14 @@ def check_appearance(views: PointViews, names: Sequence[str]) -> list[Finding]:
     """
     if len(np.unique(views.frame)) < FEWEST_FRAMES:
         return []
-    looks = without_standing_light(views)
-    light = _frames_light(views, looks, names)
+    channels = without_stationary_light(views)
+    light = _frames_light(views, channels, names)
     # A frame in shade matches no other frame, whatever the slip.
     shaded = {name for finding in light if finding.level == "red" for name in finding.values}
-    return [*light, *_frames_slip(views, looks, names, shaded)]
+    return [*light, *_frames_slip(views, channels, names, shaded)]
 
 
-def without_standing_light(views: PointViews) -> Float[np.ndarray, "n channels"]:
+def without_stationary_light(views: PointViews) -> Float[np.ndarray, "n channels"]:
     """Logarithm of each view's brightness and of its colours over it, without what its direction explains."""
     log = np.log(np.maximum(views.reflectance, 1e-3))
     brightness = log.mean(axis=1, keepdims=True)
@@ -89,11 +89,13 @@ def without_standing_light(views: PointViews) -> Float[np.ndarray, "n channels"]
     return channels - of_cell[cell]
 
 
-def _frames_light(views: PointViews, looks: Float[np.ndarray, "n channels"], names: Sequence[str]) -> list[Finding]:
+def _frames_light(
+    views: PointViews, channels: Float[np.ndarray, "n channels"], names: Sequence[str]
+) -> list[Finding]:
     """Frames in which the object is brighter or darker than in the others, as a whole or in parts."""
     numbers, cell = np.unique(views.frame), facing_cell(views)
-    of_point = mean_by_index(looks[:, 0], views.point, len(views.positions_m))
-    rest = looks[:, 0] - of_point[views.point]
+    of_point = mean_by_index(channels[:, 0], views.point, len(views.positions_m))
+    rest = channels[:, 0] - of_point[views.point]
     level, patches = np.zeros((2, len(numbers)))
     for row, number in enumerate(numbers):
         own, cells = rest[views.frame == number], cell[views.frame == number]
@@ -120,18 +122,18 @@ def _frames_light(views: PointViews, looks: Float[np.ndarray, "n channels"], nam
 
 
 def _frames_slip(
-    views: PointViews, looks: Float[np.ndarray, "n channels"], names: Sequence[str], shaded: set[str]
+    views: PointViews, channels: Float[np.ndarray, "n channels"], names: Sequence[str], shaded: set[str]
 ) -> list[Finding]:
     """Successive frames whose points match better where the object is turned on the disc between them."""
     numbers = [number for number in np.unique(views.frame) if names[number] not in shaded]
     pairs = list(zip(numbers, [*numbers[1:], numbers[0]], strict=True))
     by_frame = {number: np.flatnonzero(views.frame == number) for number in numbers}
-    scatter = _scatter(views, looks, [(by_frame[a], by_frame[b]) for a, b in pairs])
+    scatter = _scatter(views, channels, [(by_frame[a], by_frame[b]) for a, b in pairs])
     if scatter is None:
         return []
     slipped = {}
     for first, second in pairs:
-        slip_deg, fit = slip_between(views, looks / scatter, by_frame[first], by_frame[second])
+        slip_deg, fit = slip_between(views, channels / scatter, by_frame[first], by_frame[second])
         if fit < SLIP_FIT and abs(slip_deg) >= LEAST_SLIP_DEG:
             slipped[f"{names[first]} to {names[second]}"] = slip_deg
     directions = np.sign([*slipped.values()])
@@ -146,26 +148,26 @@ def _frames_slip(
 
 
 def _scatter(
-    views: PointViews, looks: np.ndarray, pairs: Sequence[tuple[np.ndarray, np.ndarray]]
+    views: PointViews, channels: np.ndarray, pairs: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> Float[np.ndarray, "channels"] | None:
     """Usual scatter of the channels between neighbouring points of successive frames; None with too few points."""
     found = []
     for first, second in pairs:
         tree = _tree_of(views, first)
-        change = _change(views, looks, tree, first, second, float(SLIPS_DEG[len(SLIPS_DEG) // 2 + 1]))
+        change = _change(views, channels, tree, first, second, float(SLIPS_DEG[len(SLIPS_DEG) // 2 + 1]))
         if change is not None:
             found.append(median_abs_deviation(change, scale="normal"))
     return np.maximum(np.median(found, axis=0), LEAST_SCATTER) if found else None
 
 
 def slip_between(
-    views: PointViews, looks: Float[np.ndarray, "n channels"], first: np.ndarray, second: np.ndarray
+    views: PointViews, channels: Float[np.ndarray, "n channels"], first: np.ndarray, second: np.ndarray
 ) -> tuple[float, float]:
     """Turn of the object about the axis from one frame to another by which its points fit best.
 
     Args:
         views: all of them.
-        looks: of each, in units of their scatter.
+        channels: of each, in units of their scatter.
         first, second: rows of the two frames.
 
     Returns:
@@ -173,7 +175,7 @@ def slip_between(
     """
     tree, differences = _tree_of(views, first), []
     for slip_deg in SLIPS_DEG:
-        change = _change(views, looks, tree, first, second, float(slip_deg))
+        change = _change(views, channels, tree, first, second, float(slip_deg))
         differences.append(np.inf if change is None else float(np.minimum(change**2, LARGEST_SIGMAS**2).mean()))
     none, best = len(SLIPS_DEG) // 2, int(np.argmin(differences))
     if not np.isfinite(differences[none]):
@@ -187,7 +189,7 @@ def _tree_of(views: PointViews, rows: np.ndarray) -> cKDTree:
 
 def _change(
     views: PointViews,
-    looks: Float[np.ndarray, "n channels"],
+    channels: Float[np.ndarray, "n channels"],
     tree: cKDTree,
     first: np.ndarray,
     second: np.ndarray,
@@ -200,11 +202,11 @@ def _change(
     # What is now at a point was before at the point that the slip brings there.
     before = rotations_about_z(np.deg2rad([-slip_deg]))[0]
     points = views.positions_m[views.point[second]] @ before.T
-    away, nearest = tree.query(points, distance_upper_bound=MATCHED_M)
-    near = np.isfinite(away)
+    distance_m, nearest = tree.query(points, distance_upper_bound=MATCHED_M)
+    near = np.isfinite(distance_m)
     if near.sum() < FEWEST_POINTS:
         return None
-    change = looks[second[near]] - looks[first[nearest[near]]]
+    change = channels[second[near]] - channels[first[nearest[near]]]
     return change - np.median(change, axis=0)
 
 

@@ -26,7 +26,7 @@ LOBE_WIDTH_RAD = 0.08
 
 
 @dataclass(frozen=True, eq=False)
-class StandingLight:
+class StationaryLight:
     """The light of a session.
 
     Attributes:
@@ -47,16 +47,16 @@ class StandingLight:
 
     def on(self, normal: Float[np.ndarray, "3"]) -> tuple[float, float]:
         """Irradiance by chamber and lamps, without their colours, on an unoccluded surface at the centre."""
-        of_chamber, of_lamps = units_on(normal, self.to_lamps)
+        of_chamber, of_lamps = unit_irradiance(normal, self.to_lamps)
         return float(of_chamber @ self.chamber), float(of_lamps @ self.lamps)
 
 
-def even_light(bands: int) -> StandingLight:
+def even_light(bands: int) -> StationaryLight:
     """The light of an even chamber without lamps."""
-    return StandingLight(np.eye(TERMS)[0], np.zeros(0), np.zeros((0, 3)), 0.0, np.ones(bands), np.ones(bands))
+    return StationaryLight(np.eye(TERMS)[0], np.zeros(0), np.zeros((0, 3)), 0.0, np.ones(bands), np.ones(bands))
 
 
-def units_on(
+def unit_irradiance(
     normal: Float[np.ndarray, "3"], to_lamps: Float[np.ndarray, "lamps 3"]
 ) -> tuple[Float[np.ndarray, "terms"], Float[np.ndarray, "lamps"]]:
     """Irradiance of each harmonic and of each lamp of strength 1 on an unoccluded surface at the centre."""
