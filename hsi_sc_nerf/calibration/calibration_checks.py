@@ -12,6 +12,7 @@ from typing import Literal
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
+from skimage.filters import threshold_otsu
 
 from hsi_sc_nerf.calibration.detector import light_of_some_lines, unlit_bands
 from hsi_sc_nerf.calibration.lamp_drift import NotMeasurable
@@ -155,14 +156,11 @@ def _check_tarp(session: Session) -> tuple[str | None, float, dict[str, object]]
 def is_partly_shaded(image: Float[np.ndarray, "lines samples"], region: Bool[np.ndarray, "lines samples"]) -> bool:
     """Whether a white's brightness has two distinct levels; uneven light alone has all levels between them."""
     smooth = cv2.blur(np.asarray(image, np.float32), (SHADE_PX, SHADE_PX))
-    values = np.sort(smooth[cv2.erode(region.astype(np.uint8), np.ones((SHADE_PX, SHADE_PX))) > 0]).astype(float)
-    if len(values) < MIN_MOVING_PX:
+    values = smooth[cv2.erode(region.astype(np.uint8), np.ones((SHADE_PX, SHADE_PX))) > 0].astype(float)
+    if len(values) < MIN_MOVING_PX or np.ptp(values) == 0.0:
         return False
-    # The two classes that are furthest apart (N. Otsu, 1979).
-    number, total = np.arange(1, len(values)), np.cumsum(values)
-    low, high = total[:-1] / number, (total[-1] - total[:-1]) / (len(values) - number)
-    best = int((number * (len(values) - number) * (high - low) ** 2).argmax())
-    fraction, low_level, high_level = number[best] / len(values), low[best], high[best]
+    is_low = values <= threshold_otsu(values)
+    fraction, low_level, high_level = is_low.mean(), values[is_low].mean(), values[~is_low].mean()
     third = (high_level - low_level) / 3.0
     between = float(((values > low_level + third) & (values < high_level - third)).mean())
     is_split = SHADE_FRACTION < fraction < 1.0 - SHADE_FRACTION and between < SHADE_BETWEEN

@@ -41,7 +41,7 @@ def common_courses(
     The courses are the singular vectors of the coefficients, in units of their errors, that exceed noise, at least
     the first. Others count by how far they exceed it, so that a little more noise changes little. The variance is to
     first order that of a truncated singular value decomposition, with the posterior variance of the spectra, and with
-    that of the courses before they are made smooth: the data do not tell well how much that gains. It has the
+    that of the courses before smoothing, whose gain the data do not determine well. It has the
     variance of each frame's output and temperature too, whose changes noise may hide.
 
     Args:
@@ -73,7 +73,7 @@ def common_courses(
 def smoothing_basis(
     positions: Float[np.ndarray, "bands"], precision: Float[np.ndarray, "bands"]
 ) -> tuple[Float[np.ndarray, "bands terms"], Float[np.ndarray, "terms"]]:
-    """The smoothest functions that the data can tell apart, orthonormal under ``precision`` (Demmler-Reinsch basis).
+    """The smoothest functions that the data distinguish, orthonormal under ``precision`` (Demmler-Reinsch basis).
 
     Args:
         positions: of the bands, all different.

@@ -53,7 +53,7 @@ class _Exposure:
 
     @property
     def other_time(self) -> bool:
-        """Whether the two were exposed for different times, as far as the headers tell."""
+        """Whether the headers state different integration times for the two."""
         dark_ms = None if self.dark is None else self.dark.integration_time_ms
         if dark_ms is None or self.counts_ms is None:
             return False

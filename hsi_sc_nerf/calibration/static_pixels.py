@@ -46,7 +46,7 @@ AVERAGED_PX, AVERAGED_TOLERANCE = 32, 0.005
 """Neighbouring pixels over which scatter must average out, and what may be left (relative): the object's reflections
 on to the wall."""
 REGIONS = 4
-"""Rows and columns of regions, with equally many static pixels each, whose means tell the error of the common course:
+"""Rows and columns of regions, with equally many static pixels each, whose means give the error of the common course:
 what changes the light on many neighbours does not average out."""
 MAX_BLOCKS, MAX_VOTERS = 64, 1024
 """Largest numbers of candidates, and of pixels that vote for them."""
@@ -214,7 +214,7 @@ def _static_with_scatter(
 def _averages_out(
     courses: Courses, common: Float[np.ndarray, "frames bins"], static: Bool[np.ndarray, "pixels"], scatter: float
 ) -> Bool[np.ndarray, "pixels"]:
-    """Pixels of blocks of neighbours whose mean follows the course: what moves takes neighbours along."""
+    """Pixels of blocks of neighbours whose mean follows the course: a moving object covers neighbours together."""
     block = np.arange(len(static)) // AVERAGED_PX
     chosen, of_block = courses.select(static), block[static]
     members = np.bincount(of_block, minlength=block[-1] + 1)

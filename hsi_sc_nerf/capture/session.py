@@ -223,7 +223,7 @@ def open_session(path: Path, *, exclude: Collection[str] = (), skip_damaged: boo
 
 
 def _white_name(info: SessionInfo, names: list[str]) -> str:
-    """The stated name of the white reference; of the default, the one capture whose name says that it is a white."""
+    """The stated name of the white reference; if none is stated, that of the only capture named like a white."""
     stated = info.white_reference != SessionInfo.white_reference
     if stated or info.white_reference in (name.lower() for name in names):
         return info.white_reference

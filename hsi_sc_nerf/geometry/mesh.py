@@ -95,5 +95,5 @@ def unoccluded(
     directions: Float[np.ndarray, "n 3"],
     nearest: float = 0.0,
 ) -> Bool[np.ndarray, "n"]:
-    """Whether rays hit nothing; what lies within ``nearest`` of a ray's origin does not count."""
+    """Whether rays hit nothing; hits within ``nearest`` of a ray's origin do not count."""
     return ~scene.test_occlusions(rays_for_scene(origins, directions), tnear=nearest).numpy()

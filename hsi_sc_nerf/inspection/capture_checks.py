@@ -50,7 +50,7 @@ def check_files(session: Session, skip_damaged: bool = False) -> list[Finding]:
 
     Args:
         session: the session.
-        skip_damaged: whether the user has chosen to do without damaged captures.
+        skip_damaged: whether the user leaves damaged captures out.
     """
     return [
         _frames(session),

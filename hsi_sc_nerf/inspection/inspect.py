@@ -75,7 +75,7 @@ def inspect_session(
         poses: how poses will be found; without a scale, "auto" and "markers" are red.
         scale_known: whether something beside ``session.json`` gives the scale.
         white_source: where the white is.
-        skip_damaged: whether the user has chosen to do without damaged captures.
+        skip_damaged: whether the user leaves damaged captures out.
 
     Raises:
         InputError: the session does not have that source of white, or a cube cannot be read.
@@ -171,7 +171,7 @@ def check_scale(session: Session, poses: PoseMethod, scale_known: bool) -> Findi
     where = f"{session.info_path}: does not give" if session.info_path.is_file() else f"{session.path}: nothing gives"
     sentence = (
         f"{where} a scale; state marker_side_m, the side of a marker's black square in metres, in session.json or "
-        "by --marker-side-m, or do without a scale by --poses colmap."
+        "by --marker-side-m, or go on without a scale by --poses colmap."
     )
     return Finding("scale", "red" if poses in ("auto", "markers") else "amber", sentence)
 

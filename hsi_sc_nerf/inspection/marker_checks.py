@@ -229,7 +229,9 @@ def _expected(session: Session, markers: Markers) -> Finding:
             f"simulated sessions with such markers have poses within {rotation_deg:g} degrees and {position_mm:g} mm "
             "(docs/validation/poses.md)"
         )
-    return Finding("expected-accuracy", "green", f"To expect: {poses}; {spectra}.", {"reflectance_noise": noise})
+    return Finding(
+        "expected-accuracy", "green", f"Expected accuracy: {poses}; {spectra}.", {"reflectance_noise": noise}
+    )
 
 
 def turn_and_rotation_deg(

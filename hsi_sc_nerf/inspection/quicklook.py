@@ -65,7 +65,7 @@ class Quicklook:
 
     @property
     def gray(self) -> UInt8[np.ndarray, "lines samples"]:
-        """Mean of the picture's channels, in which markers are looked for."""
+        """Mean of the picture's channels, which is searched for markers."""
         return to_8_bit(self.picture.mean(axis=-1))
 
 

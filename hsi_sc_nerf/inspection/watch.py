@@ -47,8 +47,8 @@ class Watch:
     def new_lines(self) -> list[str]:
         """A line for each capture that is complete and was not before.
 
-        A capture whose data file is shorter than its header says is still being written, and is waited for. A line
-        says so if another capture that came later is complete, and if ``session.json`` or the folder cannot be used.
+        A capture whose data file is shorter than its header states is still being written, and is read later. It is
+        reported if a later capture is complete, and so is a ``session.json`` or folder that cannot be used.
         """
         waited_for, self.incomplete = self.incomplete, {}
         lines = []

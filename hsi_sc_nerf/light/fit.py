@@ -244,7 +244,7 @@ class _Fit:
         return np.clip((above / np.maximum(below, 1e-9))[self._nearest_seen], 1e-4, 1.0)
 
     def _linearised(self) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m parameters"]]:
-        """Relative residuals, and relative change of what is expected with the light's parameters.
+        """Relative residuals, and relative derivatives of the expected values by the light's parameters.
 
         Both are means over the bands, weighted by the square of the expected reflectance. The parameters are the
         chamber's harmonics, the lamps, their directions along two tangents, and their nearness if there are lamps.
@@ -340,7 +340,7 @@ class _Fit:
         weighted = self._precision[:, None] / CORRELATED * slope
         gain = (weighted * slope).sum(axis=0) + COLOUR_STD**-2
         step = ((weighted * residual).sum(axis=0) + (1.0 - light.lamp_colour) * COLOUR_STD**-2) / gain
-        # Their strength is what they have in common.
+        # A change that all bands share is one of the lamps' strength.
         colour = np.clip(light.lamp_colour + step - step.mean(), 0.0, 1.0 + of_chamber / of_lamps)
         chamber_colour = 1.0 + (1.0 - colour) * of_lamps / of_chamber
         self.light = replace(light, lamp_colour=colour, chamber_colour=chamber_colour)

@@ -58,7 +58,7 @@ def container_outline(
 ) -> ContainerOutline | None:
     """Radius and foot of the upright container about the axis.
 
-    A container off the axis moves both edges to one side; the mean of both tells its radius.
+    If the container is off the axis, both edges move to one side, so the radius is the mean of both.
 
     Returns:
         None where two edges and a foot do not stand out in most frames, or do not agree.
@@ -103,7 +103,7 @@ def container_outline(
     depth = float(looks @ [-turntable.distance, 0.0, foot])
     edge = _EDGE_PX * depth / turntable.focal_px
     errors = np.hypot(scatter / np.sqrt(len(found)), [edge, edge / abs(turntable.camera_rotation[1, 2])])
-    # What stands higher is nearer to a camera that looks down, and seems wider.
+    # A higher container is nearer to a camera that looks down, and appears wider.
     nearer = looks[2] / depth * errors[1]
     return ContainerOutline(radius, float(np.hypot(errors[0] / radius, nearer)), foot, float(errors[1]))
 

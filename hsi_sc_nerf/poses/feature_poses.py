@@ -60,7 +60,7 @@ class KnownCamera:
     camera_to_world: Float[np.ndarray, "4 4"]
     """Pose at the angle 0, object frame, metres."""
     direction: Literal["ccw", "cw"] | None = None
-    """The turntable's turn seen from above; None where the earlier session does not tell."""
+    """The turntable's turn seen from above; None if the earlier session does not show it."""
 
     @property
     def distance_m(self) -> float:
@@ -271,6 +271,6 @@ def check_camera(adjusted: Adjusted, found: AdjustedTracks, camera: KnownCamera)
         return []
     sentence = (
         f"The camera is not as in the earlier session: its focal length differs by {100.0 * focal:+.1f} % and the "
-        f"axis leans by {tilt_deg:.1f} degrees; do without --camera, or take a session of the unmoved camera."
+        f"axis leans by {tilt_deg:.1f} degrees; leave out --camera, or give a session of the camera as it stands now."
     )
     return [Finding("poses-camera", "red", sentence, {"focal_percent": 100.0 * focal, "tilt_deg": tilt_deg})]

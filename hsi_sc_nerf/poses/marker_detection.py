@@ -17,7 +17,7 @@ from hsi_sc_nerf.poses.session_pictures import GRAY, SessionPictures
 Detections: TypeAlias = dict[int, Float[np.ndarray, "4 2"]]
 """Marker id to its corners in pixels (corner origin), clockwise from the upper left one of the marker's pattern."""
 
-# Markers are looked for at several magnifications, up to this length of the longer side: the adaptive threshold
+# Markers are searched for at several magnifications, up to this length of the longer side: the adaptive threshold
 # has fixed windows, and no single magnification finds both upright and foreshortened markers.
 _LARGEST_SIDE_PX = 1024
 _MAGNIFICATIONS = (1, 2, 4, 8)
@@ -36,7 +36,7 @@ _FAMILIES: dict[str, tuple[str, ...]] = {
     "DICT_APRILTAG_16h5": ("DICT_APRILTAG_16h5",),
 }
 _FRAMES_FOR_DICTIONARY = 8
-# With so many of its markers in a frame, no other family needs to be tried.
+# With this many of its markers in a frame, no other family needs to be tried.
 _CLEAR_MARKERS_PER_FRAME = 2
 
 

@@ -33,7 +33,7 @@ _LEAST_OUT_OF_FOCUS = 0.01
 # With fewer markers in its best picture, a frame's other pictures are searched too. Where more are seen, the adjusted
 # turntable predicts the rest.
 _FEW_MARKERS = 4
-# A marker that the adjustment expects is looked for if it is seen at least this steeply (cosine to its normal).
+# An expected marker is searched for if its front faces the camera at least this much (cosine to its normal).
 _STEEPEST_COSINE = 0.1
 _FARTHEST_FROM_EXPECTED_PX = 1.0
 

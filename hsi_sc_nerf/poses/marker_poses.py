@@ -32,7 +32,7 @@ def poses_from_markers(
     names: Sequence[str],
     info: SessionInfo,
 ) -> TurntablePoses:
-    """Poses from markers that turn with the object before a camera that stands still.
+    """Poses from markers that turn with the object in front of a stationary camera.
 
     Estimated are the focal length, the camera's pose, the axis, one angle per frame and the markers' layout; radial
     lens distortion and small motions of a wobbling table if the images show them (``select_model``). A few displaced

@@ -19,7 +19,7 @@ from hsi_sc_nerf.poses.turntable import MarkerObservations
 ASPECT_AMBER, ASPECT_RED = 0.005, 0.015
 """Departures from square pixels. One of 0.03 moves poses by a centimetre (docs/validation/sessions.md)."""
 _STEP, _ROUNDS = 0.02, 3
-"""Steps of the logarithm in which the best spacing is looked for."""
+"""Steps of the search for the best spacing (logarithm), and number of its rounds."""
 
 
 def pixel_aspect(adjusted: Adjusted, observations: MarkerObservations) -> tuple[float, float]:

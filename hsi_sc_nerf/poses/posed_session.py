@@ -127,7 +127,7 @@ def pose_uncertainty(
     camera[:, : len(layout.camera)] = drawn[:, layout.camera]
     turns = camera[:, None, 1:4] + angles[..., None] * turntable.camera_rotation[:, 2]
     # The camera over the disc: its distance from the axis, its height, and its arc along the circle from the first
-    # frame's. And the size of what turns.
+    # frame's. And the size of the object.
     height, size = _landmark_gradients(adjusted)
     radius, radius_variance = np.zeros_like(size), 0.0
     if outline is not None:

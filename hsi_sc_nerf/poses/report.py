@@ -17,13 +17,13 @@ from hsi_sc_nerf.poses.result import TurntablePoses, is_full_turn
 
 # The paper's target for the reprojection error (section "Pose Estimation").
 REPROJECTION_TARGET_PX = 1.0
-# Contradictions count beyond so many standard deviations.
+# Contradictions count from this many standard deviations.
 _SIGMAS = 3.0
 # A plaque that carries a marker stands off the container's wall: the container is found wider by up to this.
 _LARGEST_PLAQUE_PERCENT = 2.5
 # A distance measured by tape, from a lens whose centre is inside, is good to this.
 _DISTANCE_PERCENT = 5.0
-# A marker's side is odd if it differs by this and by so many standard deviations.
+# A marker's side is odd if it differs by this and by this many standard deviations.
 _ODD_SIDE, _ODD_SIDE_SIGMAS = 0.01, 4.0
 # A turntable's step differs from its nominal one by up to this fraction; a single angle by up to this one.
 _STEP_TOLERANCE, _ANGLE_TOLERANCE = 0.05, 0.25

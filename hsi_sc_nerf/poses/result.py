@@ -64,7 +64,7 @@ class Scale:
 class Uncertainty:
     """Standard deviations by the covariance of the adjustment; the length that gives the scale is taken for exact.
 
-    ``process`` goes by the worst frame, and the largest of many errors exceeds the standard deviation of each.
+    ``process`` checks the worst frame, and the largest of many errors exceeds the standard deviation of each.
     """
 
     focal: float

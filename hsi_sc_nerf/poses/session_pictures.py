@@ -31,7 +31,7 @@ BAND_GROUPS_NM: Mapping[str, tuple[float, float]] = {
     "red edge": (680.0, 750.0),
     "near infrared": (750.0, 900.0),
 }
-"""The other groups in which markers are looked for, nm."""
+"""The other groups of bands that are searched for markers, nm."""
 
 # The broad mean is kept unless another picture is better by this factor: many bands reduce errors outside the score.
 _CLEARLY_BETTER = 1.25
@@ -59,7 +59,7 @@ class FramePictures:
 
     Attributes:
         picture: the picture of a name.
-        scores: by the names of those in which markers are looked for, best first (``edge_precision``).
+        scores: of those that are searched for markers, by name, best first (``edge_precision``).
     """
 
     picture: Callable[[str], UInt8[np.ndarray, "h w"]]
@@ -67,7 +67,7 @@ class FramePictures:
 
     @property
     def ranking(self) -> tuple[str, ...]:
-        """Names of the pictures in which markers are looked for, best first."""
+        """Names of the pictures that are searched for markers, best first."""
         return tuple(self.scores)
 
 
@@ -227,7 +227,7 @@ def edge_precision(
     Args:
         reflectance: the picture.
         measured: which pixels are well measured; all if not given.
-        bands: the picture that is judged has so many times the bands of ``reflectance``; noise falls with their root.
+        bands: ratio of the judged picture's number of bands to that of ``reflectance``; noise falls with its root.
 
     Returns:
         0 where no pixel is exposed well.

@@ -30,13 +30,13 @@ _SMALLEST_GAIN = 1e-6
 _OUTLIER_SIGMAS = 4.0
 _LEAST_OUTLIER_PX = 0.3
 _OUTLIER_ROUNDS = 4
-# Of a turntable and its reversal in depth one is wrong if it fits so many times worse before outliers are rejected.
+# Of a turntable and its reversal in depth, one is wrong if it fits worse by this factor before outliers are rejected.
 _CLEARLY_WORSE = 2.0
 # The median length of a two-dimensional normal residual, in standard deviations of one coordinate.
 _RAYLEIGH_MEDIAN = 1.1774
 _LEAST_MARKER_OUTLIER_PX = 0.5
-# Beside markers features weigh as if their residuals were so many times larger: what displaces them all smoothly over
-# the image does not average out.
+# Together with markers, features are weighted as if their residuals were larger by this factor, because displacements
+# that vary smoothly over the image do not average out.
 _BESIDE_MARKERS = 10.0
 _LEAST_SIGMA_PX = 0.03
 # A marker whose rays are nearly parallel is not placed.

@@ -203,7 +203,7 @@ def uneven_light(seen: PointViews | None) -> Effect:
 
 def show_effects(console: Console, effects: Sequence[Effect]) -> None:
     """Print the effects as a table, and what they mean."""
-    console.print(screen_table(EFFECT_COLUMNS, effect_rows(effects), title="What the session calls for"))
+    console.print(screen_table(EFFECT_COLUMNS, effect_rows(effects), title="Effects in the session"))
     for effect in effects:
         console.print(f"{effect.name}: {effect.sentence}", highlight=False, markup=False, soft_wrap=True)
 

@@ -26,11 +26,11 @@ in standard deviations of the frames' differences, for noise frays masks."""
 BACKGROUND_SIGMAS = 3.0
 """A pixel shows the same as in the other frames up to this deviation, in their standard deviations."""
 STILL_OVERLAP = 0.97
-"""Intersection over union of all masks from which they stand still."""
+"""Intersection over union of all masks from which they count as stationary."""
 STILL_FRACTION = 0.7
 """Fraction of the masks' edge that must not change for it to be the background's."""
 STANDING_FRACTION = 0.5
-"""Fraction of the middle of the lid that what stands on it hides."""
+"""Fraction of the lid's middle that is hidden by an object on it."""
 
 
 def check_masks(
@@ -121,7 +121,7 @@ def _still(
     if still < STILL_FRACTION:
         return []
     sentence = (
-        "The masks and what they show at their edge stand still while the table turns, so they are probably the "
+        "The masks and the image at their edge are stationary while the table turns, so they are probably the "
         "wall's; look at report/masks.png and set --masks.threshold, or accept it for a smooth body of revolution on "
         "no known container."
     )

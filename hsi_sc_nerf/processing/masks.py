@@ -61,7 +61,7 @@ class MaskConfig:
     """Parts that stick out of the object (a stem) are added from this fraction of the threshold; 1 for none."""
     shaded_fraction: float | None = 0.5
     """Pixels next to the object and darker than it are added where their score relative to their brightness is more
-    than this fraction of the object's; None for none. Not applied next to what is darker still."""
+    than this fraction of the object's; None for none. Not applied next to even darker pixels."""
     overhang: float = 1.2
     """The object may reach beyond the container's lid up to this multiple of the lid's radius."""
 
@@ -120,7 +120,7 @@ def select_threshold(scores: Sequence[Float[np.ndarray, "h w"]], threshold: floa
     threshold, contrast, separation = otsu_threshold(scores)
     if contrast < MIN_CONTRAST or separation < MIN_SEPARATION:
         raise InputError(
-            f"no object can be told from the background in these frames (contrast {contrast:.3f}); check that the "
+            f"no object stands out from the background in these frames (contrast {contrast:.3f}); check that the "
             "object is in view, or give a threshold with --masks.threshold."
         )
     return threshold

@@ -194,7 +194,7 @@ def process_session(
         pose_method=poses.method,
         fingerprint=fingerprint,
     )
-    with console.status("looking for the effects that the session calls for"):
+    with console.status("measuring the effects in the session"):
         bins = BinsOfFrames(caches)
         seen = points_of_object(dataset, bins, masks, hull)
         checks.add([] if seen is None else check_appearance(seen, [frame.capture for frame in frames]))
@@ -325,7 +325,7 @@ def _boxes(
     container: Container | None,
     console: Console,
 ) -> tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "2 3"]]:
-    """The boxes of the object and of everything that turns; print what they rest on."""
+    """The boxes of the object and of everything that turns; print what is assumed for them."""
     object_box_m = object_box(hull, None if container is None else container.height_m)
     size_mm = " x ".join(f"{1000.0 * side:.0f}" for side in np.diff(object_box_m, axis=0)[0])
     console.print(f"Object: inside a box of {size_mm} mm.")

@@ -64,7 +64,7 @@ class Surface:
         return is_object
 
     def surroundings(self, directions: int) -> Surroundings:
-        """What is visible from each point, sampled in so many directions; cached."""
+        """What is visible from each point, sampled in a number of directions; cached."""
         if directions not in self._surroundings:
             self._surroundings[directions] = self._sample_surroundings(directions)
         return self._surroundings[directions]
