@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import median_abs_deviation
 
-from hsi_sc_nerf.capture.session import Capture, Session, in_short
+from hsi_sc_nerf.capture.session import Capture, Session, damaged_captures, in_short
 from hsi_sc_nerf.findings import Finding, Level, leave_out, names_in_short
 from hsi_sc_nerf.inspection.quicklook import Quicklook, saturation_level
 from hsi_sc_nerf.poses.marker_detection import Detections
@@ -128,11 +128,7 @@ def _damaged(session: Session, skip_damaged: bool) -> list[Finding]:
     if skip_damaged:
         sentence = f"Damaged, and left out by --skip-damaged: {in_short(session.damaged)}."
         return [Finding("damaged", "amber", sentence, dict(session.damaged))]
-    sentence = (
-        f"{session.path}: {in_short(session.damaged)} cannot be used; copy the captures again, or leave them out "
-        "with --skip-damaged."
-    )
-    return [Finding("damaged", "red", sentence, dict(session.damaged))]
+    return [Finding("damaged", "red", damaged_captures(session.path, session.damaged), dict(session.damaged))]
 
 
 def _same(

@@ -24,7 +24,7 @@ from hsi_sc_nerf.inspection.marker_checks import Markers, check_markers, find_ma
 from hsi_sc_nerf.inspection.paper_check import check_paper
 from hsi_sc_nerf.inspection.quicklook import Quicklook, quicklooks_of
 from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure, show_image
-from hsi_sc_nerf.poses.feature_poses import known_angles_deg
+from hsi_sc_nerf.poses.feature_poses import known_angles_deg, required_angles_deg
 from hsi_sc_nerf.poses.pose_methods import PoseMethod
 
 WHOLE_TURN_DEG = 0.05
@@ -180,13 +180,10 @@ def check_angles(session: Session, poses: PoseMethod, markers: Markers) -> list[
     """The finding ``angles`` if those of ``session.json`` cannot be used, or are needed and missing."""
     needed = poses == "angles" or (poses == "auto" and markers.dictionary is None)
     try:
-        angles_deg = known_angles_deg(session.info, len(session.frames))
+        (required_angles_deg if poses == "angles" else known_angles_deg)(session.info, len(session.frames))
     except InputError as error:
         return [Finding("angles", "red" if needed else "amber", f"{session.info_path}: {error}.")]
-    if angles_deg is not None or poses != "angles":
-        return []
-    sentence = f"{session.info_path}: the angles are not known; give nominal_step_deg or frame_angles_deg."
-    return [Finding("angles", "red", sentence)]
+    return []
 
 
 def draw_inspection(inspection: Inspection, path: Path) -> None:

@@ -8,8 +8,8 @@ import numpy as np
 
 from hsi_sc_nerf.calibration.detector import DIGITISER_LIMITS
 from hsi_sc_nerf.capture.instrument import CaptureFiles, list_captures
-from hsi_sc_nerf.capture.session import SESSION_INFO_NAME, Capture, open_captures
-from hsi_sc_nerf.capture.session_info import SessionInfo, read_session_info
+from hsi_sc_nerf.capture.session import Capture, open_captures
+from hsi_sc_nerf.capture.session_info import SESSION_INFO_NAME, SessionInfo, read_session_info
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.inspection.capture_checks import BLURRED, DARK_RED, SATURATED_RED, acquisition_day
 from hsi_sc_nerf.inspection.quicklook import Quicklook, quicklook_of, white_counts

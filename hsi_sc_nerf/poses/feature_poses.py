@@ -96,6 +96,18 @@ def known_angles_deg(info: SessionInfo, frames: int) -> Float[np.ndarray, "n"] |
     return None if info.nominal_step_deg is None else sign * info.nominal_step_deg * np.arange(frames)
 
 
+def required_angles_deg(info: SessionInfo, frames: int) -> Float[np.ndarray, "n"]:
+    """`known_angles_deg`, which must be known.
+
+    Raises:
+        InputError: they are not known, or not one angle per frame is given.
+    """
+    angles_deg = known_angles_deg(info, frames)
+    if angles_deg is None:
+        raise InputError("the angles are not known; give nominal_step_deg or frame_angles_deg in session.json")
+    return angles_deg
+
+
 def poses_from_known_camera(
     names: Sequence[str], size_px: tuple[int, int], info: SessionInfo, camera: KnownCamera
 ) -> TurntablePoses:
@@ -112,9 +124,7 @@ def poses_from_known_camera(
     """
     camera.check_size(size_px)
     direction, n = info.direction or camera.direction, len(names)
-    angles_deg = known_angles_deg(info, n)
-    if angles_deg is None:
-        raise InputError("the angles are not known; give nominal_step_deg or frame_angles_deg in session.json")
+    angles_deg = required_angles_deg(info, n)
     if direction is None:
         raise InputError(
             "which way the turntable turns is not known, neither from session.json nor from the angles of the "
@@ -163,9 +173,7 @@ def poses_from_features(
     height, width = images[0].shape
     if camera is not None:
         camera.check_size((width, height))
-    angles_deg = known_angles_deg(info, len(names))
-    if hold_angles and angles_deg is None:
-        raise InputError("the angles are not known; give nominal_step_deg or frame_angles_deg in session.json")
+    angles_deg = (required_angles_deg if hold_angles else known_angles_deg)(info, len(names))
     grays = SessionPictures.of(images).named(GRAY)
     if free is None:
         free = structure_from_motion(grays, names, focal_px=None if camera is None else camera.intrinsics.fl_x)
