@@ -50,7 +50,7 @@ from hsi_sc_nerf.files import read_json, write_json
 from hsi_sc_nerf.models.presets import ITERATIONS, PRESETS
 from hsi_sc_nerf.models.trained_run import open_run
 from hsi_sc_nerf.simulate.scene import load_scene
-from hsi_sc_nerf.simulate.true_surface import true_reference
+from hsi_sc_nerf.simulate.scores import true_reference
 from hsi_sc_nerf.simulate.truth import load_truth
 
 Part = Literal["budgets", "settings", "presets", "views", "pictures"]

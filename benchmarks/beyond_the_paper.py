@@ -31,8 +31,7 @@ from hsi_sc_nerf.evaluation.spectral_metrics import spectral_metrics
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.packed.dataset import open_packed
-from hsi_sc_nerf.simulate.processing_score import score_processing
-from hsi_sc_nerf.simulate.true_surface import true_reference
+from hsi_sc_nerf.simulate.scores import score_processing, true_reference
 from hsi_sc_nerf.simulate.truth import load_truth
 
 NOISE = ("photon_noise", "read_noise")

@@ -39,7 +39,7 @@ from hsi_sc_nerf.light.material import light_on_object, turning_elements
 from hsi_sc_nerf.light.of_run import ShadingEvidence, light_of_run, shading_evidence
 from hsi_sc_nerf.light.views import Views
 from hsi_sc_nerf.models.trained_run import open_run
-from hsi_sc_nerf.processing.voted_hull import DISC_OVER_MARKERS
+from hsi_sc_nerf.processing.visual_hull import DISC_OVER_MARKERS
 from hsi_sc_nerf.simulate.effects.light import Lamp
 from hsi_sc_nerf.simulate.truth import Truth, load_truth
 

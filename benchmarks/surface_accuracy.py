@@ -24,7 +24,7 @@ from hsi_sc_nerf.export.options import CloudOptions
 from hsi_sc_nerf.export.spectral_export import export_cloud
 from hsi_sc_nerf.geometry.mesh import ray_scene
 from hsi_sc_nerf.models.trained_run import open_run
-from hsi_sc_nerf.simulate.true_surface import true_reference
+from hsi_sc_nerf.simulate.scores import true_reference
 from hsi_sc_nerf.simulate.truth import load_truth
 
 THRESHOLDS_M = (0.002, 0.001, 0.0005)

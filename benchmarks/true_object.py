@@ -14,7 +14,7 @@ from hsi_sc_nerf.evaluation.spatial import sample_surface
 from hsi_sc_nerf.export.cloud import SpectralCloud
 from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene
 from hsi_sc_nerf.geometry.ply_file import read_ply
-from hsi_sc_nerf.simulate.true_surface import unoccluded
+from hsi_sc_nerf.simulate.scores import visible_from
 from hsi_sc_nerf.simulate.truth import Truth
 from hsi_sc_nerf.spectra import composite, to_8_bit
 
@@ -73,7 +73,7 @@ class TrueObject:
     ) -> Bool[np.ndarray, "n"]:
         """Which points of the surface are visible from at least one camera position, occluded by the object only."""
         scene = self._scene()
-        return np.any([unoccluded(scene, points_m, eye_m, FACET_LIFT_M) for eye_m in eyes_m], axis=0)
+        return np.any([visible_from(scene, points_m, eye_m, FACET_LIFT_M) for eye_m in eyes_m], axis=0)
 
     def cloud(self, count: int, eyes_m: Float[np.ndarray, "cameras 3"], noise_m: float) -> SpectralCloud:
         """The cloud of an ideal reconstruction: uniform, visible points with true spectra.

@@ -3,7 +3,7 @@
 import numpy as np
 import scipy.sparse
 
-from hsi_sc_nerf.light.standing_light import even_directions
+from hsi_sc_nerf.light.stationary_light import even_directions
 from hsi_sc_nerf.light.views import Transfer, TurningElements, Views
 
 DIRECTIONS = even_directions(2048)

@@ -1,7 +1,7 @@
-"""Can white and calibration be believed? As findings.
+"""Checks of the white reference and of the calibration, as findings.
 
-A white is flat, brighter than what the frames show in its place, and not one of the frames. Of the calibration the
-lamps' drift, clipped and saturated values, and the noise are judged.
+A white reference is flat, brighter than the frames in the same place, and not one of the frames. Of the calibration,
+the lamps' drift, clipped and saturated values, and the noise are checked.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Literal
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
+from skimage.filters import threshold_otsu
 
 from hsi_sc_nerf.calibration.detector import light_of_some_lines, unlit_bands
 from hsi_sc_nerf.calibration.lamp_drift import NotMeasurable
@@ -24,20 +25,20 @@ from hsi_sc_nerf.findings import Finding, Level
 from hsi_sc_nerf.morphology import largest_component
 
 ABOVE_WHITE = 1.05
-"""Reflectance above the white's: noise and uneven light alone take a white wall's values just above 1."""
+"""Reflectance that counts as brighter than the white: noise and uneven light alone lift a white wall just above 1."""
 ABOVE_AMBER, ABOVE_RED = 0.01, 0.05
 """Fractions of values above the white's, which will be clipped."""
 OUTSHONE, OUTSHONE_FRACTION = 2.0, 0.05
-"""A white is too dark, or coloured, if this fraction of a band's values exceeds it by this factor; highlights cover
-less of the image."""
+"""The white is too dark, or coloured, if more than this fraction of a band's values is brighter than it by this
+factor; highlights cover less of the image."""
 ROUGHNESS = 0.1
 """Largest median difference between neighbouring pixels of a white (relative)."""
 UNEVENNESS = 0.5
 """Largest range (10th to 90th percentile, relative) along a column of a WHITEREF cube."""
 MOVING = 0.3
-"""Range of a pixel's brightness over the frames (relative) from which something moves in it."""
+"""A pixel shows something that moves if its brightness varies by more than this over the frames (range, relative)."""
 MARGIN = 1.1
-"""Factor by which brightness may leave the range that it has in the frames, or exceed it."""
+"""Brightness counts as outside its range in the frames from this factor on."""
 MIN_MOVING_PX = 50
 """With fewer moving pixels, all pixels are compared."""
 ALIKE, BRIGHTER = 0.5, 0.2
@@ -51,7 +52,7 @@ WHITE_FRACTION = 0.25
 MAX_ERROR = 0.003
 """Largest standard error of a known drift."""
 LARGE_DRIFT, IMPLAUSIBLE_DRIFT = 0.3, 0.6
-"""Changes of the light that lamps rarely make, and that no warm-up makes."""
+"""Changes of the lamps' light: rare ones, and those larger than any warm-up."""
 CLIPPED_AMBER, CLIPPED_RED = 0.01, 0.2
 """Fractions of values at the upper bound. A white that clips fewer is judged by `check_white`."""
 SATURATED_AMBER, SATURATED_RED = 0.01, 0.5
@@ -59,7 +60,7 @@ SATURATED_AMBER, SATURATED_RED = 0.01, 0.5
 LOW_SNR, USELESS_SNR = 30.0, 5.0
 """Signal-to-noise ratios of one pixel of the white, median over the bands; a SPECIM IQ has more than 100."""
 MAX_SCATTER = 0.02
-"""Scatter of the still wall from frame to frame that noise and rounding do not explain."""
+"""Scatter of the stationary wall from frame to frame that noise and rounding do not explain."""
 
 
 def check_white(session: Session, source: Literal["auto"] | WhiteSource = "auto") -> list[Finding]:
@@ -91,13 +92,13 @@ def check_white(session: Session, source: Literal["auto"] | WhiteSource = "auto"
     level: Level = "red" if clipped > ABOVE_RED else "amber" if clipped > ABOVE_AMBER else "green"
     text = f"{100.0 * clipped:.2g} % of the frames' values are brighter than {white}"
     if level != "green":
-        text = f"{session.path}: {text} and will be clipped; check that it is a white, in the frames' light"
+        text = f"{session.path}: {text} and will be clipped; check that it is a white taken under the frames' light"
     found_clipped = Finding("white-clipped", level, f"{text}.", {"fraction": clipped})
     if fault is not None or not values.get("two_levels"):
         return [of_white, found_clipped]
     sentence = (
-        f"{session.path}: {white} has two levels of brightness with little between, so that a shadow fell on it or "
-        "something bright stands beside it; take it again, or give its place with --calibration.roi."
+        f"{session.path}: {white} has two distinct levels of brightness: a shadow fell on it, or something bright "
+        "stands beside it; take it again, or give its place with --calibration.roi."
     )
     return [of_white, Finding("white-shade", "amber", sentence), found_clipped]
 
@@ -126,7 +127,7 @@ def _check_tarp(session: Session) -> tuple[str | None, float, dict[str, object]]
         looks_white = None if best is None else frames[best].name
     fault = None
     if brighter < BRIGHTER and alike >= ALIKE:
-        fault = "shows the same as the frames, and nothing in it is brighter than there"
+        fault = "shows the same as the frames, and no part of it is brighter"
     elif outshone > OUTSHONE_FRACTION:
         fault = "is too dark or coloured: the frames are over twice as bright in some bands"
     elif roughness > ROUGHNESS:
@@ -153,16 +154,13 @@ def _check_tarp(session: Session) -> tuple[str | None, float, dict[str, object]]
 
 
 def is_partly_shaded(image: Float[np.ndarray, "lines samples"], region: Bool[np.ndarray, "lines samples"]) -> bool:
-    """Whether a white's brightness has two levels with little between: uneven light alone has all levels."""
+    """Whether a white's brightness has two distinct levels; uneven light alone has all levels between them."""
     smooth = cv2.blur(np.asarray(image, np.float32), (SHADE_PX, SHADE_PX))
-    values = np.sort(smooth[cv2.erode(region.astype(np.uint8), np.ones((SHADE_PX, SHADE_PX))) > 0]).astype(float)
-    if len(values) < MIN_MOVING_PX:
+    values = smooth[cv2.erode(region.astype(np.uint8), np.ones((SHADE_PX, SHADE_PX))) > 0].astype(float)
+    if len(values) < MIN_MOVING_PX or np.ptp(values) == 0.0:
         return False
-    # The two classes that are furthest apart (N. Otsu, 1979).
-    number, total = np.arange(1, len(values)), np.cumsum(values)
-    low, high = total[:-1] / number, (total[-1] - total[:-1]) / (len(values) - number)
-    best = int((number * (len(values) - number) * (high - low) ** 2).argmax())
-    fraction, low_level, high_level = number[best] / len(values), low[best], high[best]
+    is_low = values <= threshold_otsu(values)
+    fraction, low_level, high_level = is_low.mean(), values[is_low].mean(), values[~is_low].mean()
     third = (high_level - low_level) / 3.0
     between = float(((values > low_level + third) & (values < high_level - third)).mean())
     is_split = SHADE_FRACTION < fraction < 1.0 - SHADE_FRACTION and between < SHADE_BETWEEN
@@ -218,9 +216,11 @@ def _check_own_whites(session: Session) -> tuple[str | None, float, dict[str, ob
 def _compare_with_white(
     frames: Sequence[Capture], whites: Sequence[Float[np.ndarray, "columns bands"]], live: Bool[np.ndarray, "bands"]
 ) -> tuple[Float[np.ndarray, "frames lines samples"], float, float]:
-    """Brightness of the frames' lines; fraction of values above the white's; and largest fraction far above it.
+    """Compare frames with their whites, which are scaled to the frames' exposures.
 
-    The whites are at the frames' exposures, the last fraction is that of the worst of the live bands.
+    Returns:
+        Brightness of the frames' lines; the fraction of values above the white's; and, of the worst live band, the
+        fraction far above it.
     """
     images, clipped, outshone = [], [], []
     for frame, white in zip(frames, whites, strict=True):
@@ -242,7 +242,7 @@ def check_calibration(session: Session, calibration: SessionCalibration) -> list
 
 
 def check_clipped(session: Session, calibration: SessionCalibration, counts: PixelCounts, pixels: int) -> Finding:
-    """The finding ``clipped``, by the values of all frames that were clipped at the upper bound or are saturated.
+    """The finding ``clipped``: the fractions of values that were clipped at the upper bound or are saturated.
 
     Args:
         session: its bands.
@@ -270,9 +270,9 @@ def check_clipped(session: Session, calibration: SessionCalibration, counts: Pix
 def _check_drift(session: Session, calibration: SessionCalibration) -> Finding:
     drift = calibration.drift
     if calibration.source != "tarp":
-        return Finding("drift", "green", "Lamps: every frame has a white of its own, which follows them.")
+        return Finding("drift", "green", "Lamps: every frame has a white of its own, so their drift cancels.")
     if isinstance(drift, NotMeasurable):
-        sentence = f"the lamps' drift was not measured, because {drift.reason}; show more of the still chamber."
+        sentence = f"the lamps' drift was not measured, because {drift.reason}; show more of the chamber's wall."
         return Finding("drift", "amber", f"{session.path}: {sentence}", {"measured": False})
     change = float(np.abs(drift.factor[:, calibration.bands] - 1.0).max())
     error = float(drift.standard_error[:, calibration.bands].max())
@@ -283,7 +283,9 @@ def _check_drift(session: Session, calibration: SessionCalibration) -> Finding:
         level: Level = "red" if change > IMPLAUSIBLE_DRIFT else "amber"
         return Finding("drift", level, f"{session.path}: {text}; check lamps and exposure times.", values)
     if error > MAX_ERROR:
-        sentence = f"{text}, but only to {100.0 * error:.1f} %, from {pixels} pixels; show more of the still chamber."
+        sentence = (
+            f"{text}, measured to {100.0 * error:.1f} % only, from {pixels} pixels; show more of the chamber's wall."
+        )
         return Finding("drift", "amber", f"{session.path}: {sentence}", values)
     return Finding("drift", "green", f"Lamps: {text}, known to {100.0 * error:.2f} %.", values)
 
@@ -302,7 +304,9 @@ def _check_noise(session: Session, calibration: SessionCalibration) -> Finding:
         level: Level = "red" if snr < USELESS_SNR else "amber"
         return Finding("noise", level, f"{session.path}: {text}; use more light or a longer exposure.", values)
     if scatter > MAX_SCATTER:
-        sentence = f"the still wall scatters by {100.0 * scatter:.1f} % from frame to frame; check lamps and shadows."
+        sentence = (
+            f"the stationary wall scatters by {100.0 * scatter:.1f} % from frame to frame; check lamps and shadows."
+        )
         return Finding("noise", "amber", f"{session.path}: {sentence}", values)
     if not (noise.read_noise_measured and noise.photon_noise_measured):
         what = "read noise" if noise.photon_noise_measured else "photon noise"

@@ -28,6 +28,8 @@ DEAD_BAND_FRACTION = 0.5
 """A band with a larger fraction of dead elements is bad."""
 MIN_LIGHT = 0.001
 """A band in which the white counts less than this fraction of its brightest band is unlit."""
+DIGITISER_LIMITS = {2**bits - 1 for bits in range(8, 33)} | {(2**bits - 1) << (16 - bits) for bits in (10, 12, 14)}
+"""Largest counts of digitisers, also of those that shift their numbers up to 16 bits."""
 MIN_AT_LIMIT = 3
 """Fewest readings at the limit of a digitiser that are taken for saturation."""
 BELOW_TOP = 10
@@ -169,9 +171,9 @@ def pooled_darks(
 ) -> list[Float[np.ndarray, "columns bands"]]:
     """The frames' dark counts with the pattern of columns and bands that all share, and each frame's own level.
 
-    A frame's dark cube has few lines, so that its noise is the same in all lines of the frame, and that of a band's
-    level is in all its pixels. A frame's level is one offset of all bands, or has a value in each band where the
-    frames differ so by more than noise. The frames' darks are kept as they are if their columns' patterns differ.
+    A dark cube has few lines. Its noise is subtracted from every line of the frame, and the noise of a band's level
+    from every pixel. A frame's level is one offset for all bands, or one value for each band if the frames differ by
+    more than noise. If the frames' patterns differ, their darks are returned unchanged.
 
     Args:
         read_noise: standard deviation of one reading.
@@ -252,7 +254,7 @@ def saturation_counts(
     The candidate is the largest reading T. It may also be just the brightest pixel, or shared by many pixels of an
     even background without noise. T is the saturation level in two cases:
 
-    1. T is the limit of a digitiser (2^k - 1, the same shifted up to 16 bits, or the data type's largest), and at
+    1. T is the limit of a digitiser (`DIGITISER_LIMITS`, or the data type's largest), and at
        least ``MIN_AT_LIMIT`` readings have it, and more than have the next lower value.
     2. Readings pile up at T: more than at the ``BELOW_TOP`` counts under it together. Where one of two neighbours is
        at T, usually both are, while equal neighbours are rare among other bright readings, because of noise.
@@ -263,8 +265,7 @@ def saturation_counts(
     readings = [cube[:, live] for cube in cubes]
     at_top = sum(np.count_nonzero(of_cube == top) for of_cube in readings)
     dtype = cubes[0].dtype
-    limits = {2**bits - 1 for bits in range(8, 33)} | {(2**bits - 1) << (16 - bits) for bits in (10, 12, 14)}
-    if top in limits or (dtype.kind in "iu" and top == np.iinfo(dtype).max):
+    if top in DIGITISER_LIMITS or (dtype.kind in "iu" and top == np.iinfo(dtype).max):
         lower = [of_cube[of_cube < top] for of_cube in readings]
         next_lower = max((of_cube.max() for of_cube in lower if len(of_cube)), default=top)
         at_next = sum(np.count_nonzero(of_cube == next_lower) for of_cube in lower)

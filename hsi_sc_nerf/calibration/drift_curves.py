@@ -1,9 +1,9 @@
 """Curves of the lamps' drift over wavelength: smooth, and shared by all frames.
 
-Lamps drift with one course over the session or two, each with one spectrum (a low rank over frames and bands). The
-spectrum is a smoothing spline over 1 / wavelength, whose smoothness is the most likely one for the data: where few
-counts tell little, neighbouring bands tell more, and a drift of the blue alone stays in the blue. The course over the
-frames is smooth as well, unless a frame contradicts it: lamps warm up slowly, but may be switched.
+The drift of lamps is a sum of one or two courses over the session, each with one spectrum (a low rank over frames and
+bands). The spectrum is a smoothing spline over 1 / wavelength with the most likely smoothness for the data: in noisy
+bands the neighbouring bands determine it, and a drift of the blue alone stays in the blue. The course over the frames
+is smooth as well, unless a frame contradicts it: lamps warm up slowly, but may be switched.
 
 P. J. Green and B. W. Silverman, "Nonparametric Regression and Generalized Linear Models", 1994; G. Wahba, Annals of
 Statistics 13, 1985; M. Gavish and D. Donoho, "Optimal Shrinkage of Singular Values", 2017.
@@ -41,7 +41,7 @@ def common_courses(
     The courses are the singular vectors of the coefficients, in units of their errors, that exceed noise, at least
     the first. Others count by how far they exceed it, so that a little more noise changes little. The variance is to
     first order that of a truncated singular value decomposition, with the posterior variance of the spectra, and with
-    that of the courses before they are made smooth: the data do not tell well how much that gains. It has the
+    that of the courses before smoothing, whose gain the data do not determine well. It has the
     variance of each frame's output and temperature too, whose changes noise may hide.
 
     Args:
@@ -73,7 +73,7 @@ def common_courses(
 def smoothing_basis(
     positions: Float[np.ndarray, "bands"], precision: Float[np.ndarray, "bands"]
 ) -> tuple[Float[np.ndarray, "bands terms"], Float[np.ndarray, "terms"]]:
-    """The smoothest functions that the data can tell apart, orthonormal under ``precision`` (Demmler-Reinsch basis).
+    """The smoothest functions that the data distinguish, orthonormal under ``precision`` (Demmler-Reinsch basis).
 
     Args:
         positions: of the bands, all different.

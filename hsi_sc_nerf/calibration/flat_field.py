@@ -15,7 +15,7 @@ from hsi_sc_nerf.robust_scatter import robust_std
 ORDER = 4
 """Total order of the surface's polynomial."""
 EDGE_FRACTION = 32
-"""The tarp's shorter side over this is left out along its edge, which may be blurred, frayed or curled."""
+"""A margin of the tarp's shorter side over this is left out, because its edge may be blurred, frayed or curled."""
 REACH = 1.25
 """The surface is constant beyond this many half widths of the tarp from its middle."""
 VALUE_REACH = 0.5
@@ -59,7 +59,7 @@ def flat_field(
     terms = (ORDER + 1) * (ORDER + 2) // 2
     if np.count_nonzero(region) < 10 * terms:
         raise InputError(
-            f"{header}: the tarp is too small in its image to tell how the light falls off; leave out "
+            f"{header}: the tarp is too small in its image to measure the falloff of the light; leave out "
             "--calibration.flat-field."
         )
     return fit_surface(brightness, region, ORDER).astype(np.float32)

@@ -1,10 +1,10 @@
 """Drift of the lamps over a session, from the static part of the chamber.
 
-Some lines of each frame are read, and the pixels that follow one common course over the frames are static
-(`static_pixels`). The common grey level is a robust mean over them, in which their scatter averages out. The change
-of each band comes from the sum of their spectra, each divided by its own deviation from the grey level, in which a
-scatter that is common to all bands cancels. A smooth curve over 1 / wavelength, which all frames share, removes the
-bands' noise (`drift_curves`).
+Some lines of each frame are read. Pixels whose light follows one common course over the frames are static
+(`static_pixels`). The change of the grey level is a robust mean over them, in which their scatter averages out. The
+change of each band is taken from the sum of their spectra. Each spectrum is first divided by its own deviation from
+the grey level, so that scatter which all bands share cancels. A smooth curve over 1 / wavelength, shared by all
+frames, removes the bands' noise (`drift_curves`).
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ BINS = 12
 MIN_SIGNAL = 10.0
 """Least signal-to-noise ratio of a band in the curve's fit."""
 TESTED_TERMS, MIN_BANDS = 6, 3
-"""The smoothest terms over 1 / wavelength that tell whether there is a drift, and fewest bands: a change of output
-and of colour temperature is linear in it, but lamps may lose more in the blue alone."""
+"""Number of the smoothest terms over 1 / wavelength that are tested for a drift, and fewest bands. A change of output
+and colour temperature is linear in 1 / wavelength, but lamps may lose more in the blue alone."""
 FLOOR = 0.001
 """Relative change of the light (root mean square over frames and bands) that is not taken for drift: the turning
 object changes the light on the chamber's wall."""
@@ -123,7 +123,7 @@ def measure_lamp_drift(
     total, variance = survey.sum_over(image, unusable, np.exp(-deviation))
     lit = (total > MIN_SIGNAL * np.sqrt(variance)).all(axis=0)
     if lit.sum() < MIN_BANDS:
-        return NotMeasurable("what stands still in the image is too dark")
+        return NotMeasurable("the stationary part of the image is too dark")
     measured = np.full(total.shape, np.nan)
     measured[:, lit] = total[:, lit] / total[0, lit]
     log_light, variance = np.log(total[:, lit]), (variance[:, lit] / total[:, lit] ** 2).mean(axis=0)

@@ -16,7 +16,8 @@ from scipy import stats
 from hsi_sc_nerf.robust_scatter import robust_std
 
 MIN_PIXELS, MIN_FRACTION, MIN_SCATTERING_FRACTION = 64, 0.05, 0.15
-"""Fewest static pixels, and their least fraction of all, without and with scatter: it leaves more room for chance."""
+"""Fewest static pixels, and their least fraction of all pixels without and with scatter: with scatter, more pixels
+follow a course by chance."""
 MIN_SIGNAL = 10.0
 """Least signal-to-noise ratio of a pixel's bin, so that its logarithm is normal."""
 TOLERANCE = 0.002
@@ -24,7 +25,7 @@ TOLERANCE = 0.002
 change by the same factor everywhere, and a bin's bands have other weights in every pixel."""
 SCATTERS = (0.0, 0.01, 0.02, 0.04, 0.08)
 """Scatters of the grey level that are tried, ascending (relative)."""
-MORE = 1.4
+CLEARLY_MORE = 1.4
 """A larger scatter is taken if it makes more than this many times as many pixels static."""
 SCATTER_OF_COLOUR = 0.2
 """Scatter of the colour relative to that of the grey level."""
@@ -45,7 +46,7 @@ AVERAGED_PX, AVERAGED_TOLERANCE = 32, 0.005
 """Neighbouring pixels over which scatter must average out, and what may be left (relative): the object's reflections
 on to the wall."""
 REGIONS = 4
-"""Rows and columns of regions, with equally many static pixels each, whose means tell the error of the common course:
+"""Rows and columns of regions, with equally many static pixels each, whose means give the error of the common course:
 what changes the light on many neighbours does not average out."""
 MAX_BLOCKS, MAX_VOTERS = 64, 1024
 """Largest numbers of candidates, and of pixels that vote for them."""
@@ -134,7 +135,7 @@ def static_pixels(courses: Courses) -> tuple[Bool[np.ndarray, "pixels"], Float[n
     for scatter in SCATTERS:
         static, common = _static_with_scatter(courses, scatter)
         fraction = MIN_SCATTERING_FRACTION if scatter > 0.0 else MIN_FRACTION
-        if static.sum() >= max(MIN_PIXELS, fraction * len(static), MORE * best.sum()):
+        if static.sum() >= max(MIN_PIXELS, fraction * len(static), CLEARLY_MORE * best.sum()):
             best, course = static, common
         elif best.any():
             break
@@ -213,7 +214,7 @@ def _static_with_scatter(
 def _averages_out(
     courses: Courses, common: Float[np.ndarray, "frames bins"], static: Bool[np.ndarray, "pixels"], scatter: float
 ) -> Bool[np.ndarray, "pixels"]:
-    """Pixels of blocks of neighbours whose mean follows the course: what moves takes neighbours along."""
+    """Pixels of blocks of neighbours whose mean follows the course: a moving object covers neighbours together."""
     block = np.arange(len(static)) // AVERAGED_PX
     chosen, of_block = courses.select(static), block[static]
     members = np.bincount(of_block, minlength=block[-1] + 1)

@@ -1,4 +1,4 @@
-"""Where a session's white is, and what it reflects itself.
+"""Where a session's white reference is, and its own reflectance.
 
 The white is a tarp, the WHITEREF cubes, a target in the frames, or none for finished reflectance. A certificate gives
 its reflectance.
@@ -23,7 +23,7 @@ WhiteSource = Literal["tarp", "capture", "target", "product"]
 LARGEST_FRACTION = 1.5
 """Reflectances are percent if any is larger than this, and fractions otherwise."""
 SHORTEST_NM = 100.0
-"""No imaging spectrometer measures shorter wavelengths; smaller numbers are no nanometres."""
+"""No imaging spectrometer measures shorter wavelengths; smaller numbers are not nanometres."""
 _FORMAT = "two columns, wavelength_nm and reflectance"
 
 
@@ -160,7 +160,7 @@ def _read(path: Path) -> tuple[Float[np.ndarray, "lines"], Float[np.ndarray, "li
     if not (fractions.min() > 0.0 and fractions.max() <= LARGEST_FRACTION):
         wrong = reflectance.argmin() if fractions.min() <= 0.0 else reflectance.argmax()
         raise InputError(
-            f"{path}: gives a reflectance of {reflectance[wrong]:g} at {panel_nm[wrong]:g} nm, but a white reflects "
-            "more than nothing and at most about 1, or 100 percent; correct it."
+            f"{path}: gives a reflectance of {reflectance[wrong]:g} at {panel_nm[wrong]:g} nm, but that of a white "
+            "is above 0 and at most about 1, or 100 percent; correct it."
         )
     return panel_nm, fractions

@@ -34,13 +34,14 @@ _NM_PER_UNIT = {
 _NO_LENGTHS = ("wavenumber", "ghz", "mhz", "index")
 # No imaging spectrometer measures below 100 nm or beyond 100 µm. Smaller numbers without a unit are micrometres.
 _SENSIBLE_NM = (100.0, 100_000.0)
-# No instrument or library has more bands. Lists of one value a band are made before there is a data file to compare.
+# No instrument or library has more bands. Lists with one value a band are made before the data file's size is
+# checked.
 _MOST_BANDS = 100_000
 
 
 @dataclass(frozen=True, eq=False)
 class EnviHeader:
-    """What a header says about its cube.
+    """The content of an ENVI header.
 
     Attributes:
         header_path: the header file.

@@ -3,7 +3,7 @@
 A SPECIM IQ makes a folder for each capture: ``capture/`` holds the counts NAME, the dark DARKREF_NAME, a white
 WHITEREF_NAME and its dark WHITEDARKREF_NAME; ``results/`` the instrument's own REFLECTANCE_NAME; and
 ``metadata/NAME.xml`` its settings. A plain folder of ENVI pairs uses the same names, and ``dark...`` is the dark cube
-of all. Files are told apart by their names alone.
+of all. Files are recognised by their names alone.
 """
 
 from __future__ import annotations
@@ -212,7 +212,7 @@ def read_metadata(path: Path) -> SpecimMetadata:
 
 
 def usual_rotation_deg(header: EnviHeader) -> int:
-    """Rotation of a file's image from upright, counter-clockwise, as far as its header tells.
+    """Rotation of a file's image from upright, counter-clockwise, by its header.
 
     It is 90 if the ``sensor type`` or ``description`` is that of a real SPECIM IQ, else 0.
     """

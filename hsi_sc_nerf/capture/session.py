@@ -23,8 +23,7 @@ from hsi_sc_nerf.capture.instrument import (
     usual_rotation_deg,
     with_band_widths,
 )
-from hsi_sc_nerf.capture.session_info import SESSION_INFO_NAME as SESSION_INFO_NAME
-from hsi_sc_nerf.capture.session_info import SessionInfo, read_band_centres, read_session_info
+from hsi_sc_nerf.capture.session_info import SESSION_INFO_NAME, SessionInfo, read_band_centres, read_session_info
 from hsi_sc_nerf.errors import InputError
 
 # Headers list centres to about 0.01 nm; two captures of one instrument agree to that.
@@ -204,10 +203,7 @@ def open_session(path: Path, *, exclude: Collection[str] = (), skip_damaged: boo
     frames = [capture for capture in captures if capture.name.lower() != white_name]
     frames = _consistent(frames, tarp, damaged)
     if damaged and not skip_damaged:
-        raise InputError(
-            f"{path}: {in_short(damaged)} cannot be used; copy the captures again, or leave them out with "
-            "--skip-damaged."
-        )
+        raise InputError(damaged_captures(path, damaged))
     _check_whites(path, info, tarp, frames)
     if len(frames) < 2:
         raise InputError(
@@ -223,7 +219,7 @@ def open_session(path: Path, *, exclude: Collection[str] = (), skip_damaged: boo
 
 
 def _white_name(info: SessionInfo, names: list[str]) -> str:
-    """The stated name of the white reference; of the default, the one capture whose name says that it is a white."""
+    """The stated name of the white reference; if none is stated, that of the only capture named like a white."""
     stated = info.white_reference != SessionInfo.white_reference
     if stated or info.white_reference in (name.lower() for name in names):
         return info.white_reference
@@ -234,6 +230,13 @@ def _white_name(info: SessionInfo, names: list[str]) -> str:
 def in_short(damaged: Mapping[str, str]) -> str:
     """Captures that cannot be used, each with the reason."""
     return ", ".join(f"{name} ({reason.split(': ', 1)[-1].split('; ')[0]})" for name, reason in damaged.items())
+
+
+def damaged_captures(path: Path, damaged: Mapping[str, str]) -> str:
+    """The sentence that refuses a session with captures that cannot be used."""
+    return (
+        f"{path}: {in_short(damaged)} cannot be used; copy the captures again, or leave them out with --skip-damaged."
+    )
 
 
 def _check_whites(path: Path, info: SessionInfo, tarp: Capture | None, frames: list[Capture]) -> None:

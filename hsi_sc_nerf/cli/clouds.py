@@ -53,7 +53,7 @@ class CompareCommand:
 
         # Slow to import.
         from hsi_sc_nerf.evaluation.comparison_report import comparison_tables, write_comparison
-        from hsi_sc_nerf.simulate.true_surface import true_reference
+        from hsi_sc_nerf.simulate.scores import true_reference
 
         if self.reference.is_dir():
             reference = true_reference(self.reference, self.config, shown)

@@ -30,7 +30,7 @@ from hsi_sc_nerf.geometry.camera import project
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.packed.dataset import PackedDataset, open_packed
 from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure, show_image
-from hsi_sc_nerf.simulate.processing_score import ProcessingScore, score_processing
+from hsi_sc_nerf.simulate.scores import ProcessingScore, score_processing
 from hsi_sc_nerf.simulate.truth import load_truth
 
 SPECTRAL_METRICS = ("sam", "rmse", "ssim", "psnr")

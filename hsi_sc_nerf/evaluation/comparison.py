@@ -123,7 +123,7 @@ def compare(
 
     Args:
         cloud_path: PLY cloud, or PLY, OBJ or STL mesh, in metres.
-        reference: `read_reference` of a file, or `hsi_sc_nerf.simulate.true_surface.true_reference` of a
+        reference: `read_reference` of a file, or `hsi_sc_nerf.simulate.scores.true_reference` of a
             simulated session.
 
     Raises:

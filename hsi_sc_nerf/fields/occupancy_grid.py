@@ -16,9 +16,9 @@ from torch import Tensor, nn
 
 from hsi_sc_nerf.fields.ray_marching import sample_occupied
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project
-from hsi_sc_nerf.geometry.visual_hull import MAX_MISSED_FRACTION, visual_hull
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
+from hsi_sc_nerf.processing.visual_hull import MAX_MISSED_FRACTION, visual_hull
 
 GRID_CELLS = 128
 """Cells along the longest side of the scene box."""

@@ -124,7 +124,7 @@ def pixel_rays(
         axis=-1,
     )
     directions = in_camera @ camera_to_world[:3, :3].T
-    return camera_to_world[:3, 3], directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    return camera_to_world[:3, 3], unit_vectors(directions)
 
 
 def closest_point_to_rays(
@@ -155,6 +155,11 @@ def closest_point_to_rays(
     known = eigenvalues > 1e-12 * eigenvalues[:, 2:]
     coordinates = np.where(known, along_axes / np.where(known, eigenvalues, 1.0), 0.0)
     return np.einsum("pij,pj->pi", axes, coordinates), eigenvalues[:, 0]
+
+
+def unit_vectors(vectors: Float[np.ndarray, "*n k"]) -> Float[np.ndarray, "*n k"]:
+    """Vectors of length 1 in the same directions; 0 stays 0."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)
 
 
 def cross_matrix(v: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:

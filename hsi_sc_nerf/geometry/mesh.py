@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+
+from hsi_sc_nerf.geometry.camera import unit_vectors
 
 if TYPE_CHECKING:
     from open3d.t.geometry import RaycastingScene
@@ -54,13 +56,11 @@ class Mesh:
 
     def facet_normals(self) -> Float[np.ndarray, "t 3"]:
         """Outward unit normal of each triangle, 0 for one without an area."""
-        doubled = self._doubled_normals()
-        return doubled / np.maximum(np.linalg.norm(doubled, axis=1, keepdims=True), 1e-30)
+        return unit_vectors(self._doubled_normals())
 
     def vertex_normals(self) -> Float[np.ndarray, "v 3"]:
         """Outward unit normal of each vertex: the area-weighted mean of its triangles', 0 for a vertex of none."""
-        normals = self.area_weighted_normals()
-        return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        return unit_vectors(self.area_weighted_normals())
 
     def area_weighted_normals(self) -> Float[np.ndarray, "v 3"]:
         """Sum of the outward normals of each vertex's triangles, each as long as twice the triangle's area."""
@@ -80,3 +80,20 @@ def ray_scene(vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 
     scene = RaycastingScene()
     scene.add_triangles(Tensor(np.asarray(vertices, np.float32)), Tensor(np.asarray(triangles, np.uint32)))
     return scene
+
+
+def rays_for_scene(
+    origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 6"]:
+    """Rays as Open3D takes them: origin and direction in one row, single precision."""
+    return np.concatenate([origins, directions], axis=1, dtype=np.float32)
+
+
+def unoccluded(
+    scene: RaycastingScene,
+    origins: Float[np.ndarray, "n 3"],
+    directions: Float[np.ndarray, "n 3"],
+    nearest: float = 0.0,
+) -> Bool[np.ndarray, "n"]:
+    """Whether rays hit nothing; hits within ``nearest`` of a ray's origin do not count."""
+    return ~scene.test_occlusions(rays_for_scene(origins, directions), tnear=nearest).numpy()

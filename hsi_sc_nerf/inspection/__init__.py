@@ -1,1 +1,1 @@
-"""Checks of a session before it is believed: its files, its white, its frames, its markers."""
+"""Checks of a session before its processing: its files, white reference, frames and markers."""

@@ -1,4 +1,4 @@
-"""Checks of the captures: what their headers say, exposure, focus, copies, and frames of another object."""
+"""Checks of the captures: headers, exposure, focus, copies, and frames of another object."""
 
 from __future__ import annotations
 
@@ -11,22 +11,24 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import median_abs_deviation
 
-from hsi_sc_nerf.capture.session import Capture, Session, in_short
+from hsi_sc_nerf.capture.session import Capture, Session, damaged_captures, in_short
 from hsi_sc_nerf.findings import Finding, Level, leave_out, names_in_short
 from hsi_sc_nerf.inspection.quicklook import Quicklook, saturation_level
 from hsi_sc_nerf.poses.marker_detection import Detections
 
 _DAY = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}")
 SATURATED_AMBER, SATURATED_RED = 0.005, 0.25
-"""Fractions of a frame's values: highlights are flagged value by value; from the red one the exposure is wrong."""
+"""Fractions of a frame's values that are saturated: highlights are flagged one by one; above the second limit the
+exposure is wrong."""
 DARK_AMBER, DARK_RED = 0.2, 0.95
-"""Fractions of a frame's values without light: a good session has some in its outermost bands, a covered lens all."""
+"""Fractions of a frame's values without light: some in the outermost bands of a good session, all with a covered
+lens."""
 BLURRED = 0.6
 """A frame is less sharp than the others if its edges have this fraction of their slope."""
 COMPARED_PX = 40
 """Side of the pictures in which frames are compared."""
 FEWEST_COMPARED = 8
-"""Fewest frames among which one can be told to be different."""
+"""Fewest frames with which a different one can be recognised."""
 ACCURACY_BY_VIEWS = {
     8: (3.4, 74, 1.5, 7),
     12: (2.6, 93, 0.2, 12),
@@ -37,7 +39,7 @@ ACCURACY_BY_VIEWS = {
 """Percent by number of views: root mean square error of the reflectance, F-score at 0.5 mm, error of the volume and
 of the area of a bruise (docs/validation/accuracy_and_time.md)."""
 LEAST_SPREAD, LARGEST_DEVIATION = 0.02, 8.0
-"""Deviations count in units of a pixel's spread over the frames, of this reflectance at least, up to this many."""
+"""Deviations are divided by a pixel's spread over the frames (at least this reflectance) and limited to this many."""
 DIFFERENT_AMBER, DIFFERENT_RED = 1.5, 2.7
 """Deviation of a frame over the median of all. Frames of one object, also of a long or bruised one over half a turn,
 stay below 1.3; a camera moved by 2 of 128 pixels gives 2.3; another kind of fruit 3.5 to 8."""
@@ -48,7 +50,7 @@ def check_files(session: Session, skip_damaged: bool = False) -> list[Finding]:
 
     Args:
         session: the session.
-        skip_damaged: whether the user has chosen to do without damaged captures.
+        skip_damaged: whether the user leaves damaged captures out.
     """
     return [
         _frames(session),
@@ -88,12 +90,13 @@ def _binning(capture: Capture) -> str | None:
 
 
 def _accuracy_of(views: int) -> str:
-    """What a simulated pear of at most so many views was like."""
+    """How accurately a simulated pear was reconstructed from this number of views, or the next smaller one."""
     tried = max((count for count in ACCURACY_BY_VIEWS if count <= views), default=min(ACCURACY_BY_VIEWS))
     rmse_percent, near_percent, volume_percent, bruise_percent = ACCURACY_BY_VIEWS[tried]
     return (
-        f"of {tried} views, a simulated pear had its reflectance right to {rmse_percent:g} %, {near_percent:g} % of "
-        f"its surface to 0.5 mm, its volume to {volume_percent:g} % and the area of a bruise to {bruise_percent:g} %"
+        f"with {tried} views, a simulated pear had errors of {rmse_percent:g} % in reflectance, {volume_percent:g} % "
+        f"in volume and {bruise_percent:g} % in the area of a bruise, and {near_percent:g} % of its surface was "
+        "within 0.5 mm"
     )
 
 
@@ -106,7 +109,7 @@ def _frames(session: Session) -> Finding:
     if session.excluded:
         parts.append(f"left out by --exclude: {names_in_short(session.excluded)}")
     if session.skipped:
-        parts.append(f"beside them, no captures: {names_in_short(list(session.skipped))}")
+        parts.append(f"not captures: {names_in_short(list(session.skipped))}")
     values = {
         "frames": [frame.name for frame in session.frames],
         "white": None if session.white is None else session.white.name,
@@ -125,11 +128,7 @@ def _damaged(session: Session, skip_damaged: bool) -> list[Finding]:
     if skip_damaged:
         sentence = f"Damaged, and left out by --skip-damaged: {in_short(session.damaged)}."
         return [Finding("damaged", "amber", sentence, dict(session.damaged))]
-    sentence = (
-        f"{session.path}: {in_short(session.damaged)} cannot be used; copy the captures again, or leave them out "
-        "with --skip-damaged."
-    )
-    return [Finding("damaged", "red", sentence, dict(session.damaged))]
+    return [Finding("damaged", "red", damaged_captures(session.path, session.damaged), dict(session.damaged))]
 
 
 def _same(
@@ -140,7 +139,7 @@ def _same(
     level: Level,
     advice: str,
 ) -> Finding:
-    """Whether a value of the headers, named in singular and plural, is the same in all frames; others are named."""
+    """The finding on a value of the headers, named in singular and plural, that should be the same in all frames."""
     what, whats = one_and_more
     values: Mapping[str, object] = {frame.name: value_of(frame) for frame in session.frames}
     given = Counter(value for value in values.values() if value is not None)
@@ -192,9 +191,9 @@ def deviations(pictures: Sequence[Float[np.ndarray, "h w channels"]]) -> Float[n
     small = np.clip(np.stack(resized), 0.0, 1.5)
     brightness = np.median(small / np.maximum(np.median(small, axis=0), 0.02), axis=(1, 2, 3), keepdims=True)
     small /= np.maximum(brightness, 1e-3)
-    away = np.abs(small - np.median(small, axis=0))
+    difference = np.abs(small - np.median(small, axis=0))
     spread = np.maximum(median_abs_deviation(small, scale="normal"), LEAST_SPREAD)
-    deviation = np.minimum(away / spread, LARGEST_DEVIATION).mean(axis=(1, 2, 3))
+    deviation = np.minimum(difference / spread, LARGEST_DEVIATION).mean(axis=(1, 2, 3))
     return deviation / max(float(np.median(deviation)), 1e-12)
 
 
@@ -211,15 +210,15 @@ def _exposure(session: Session, quicklooks: Sequence[Quicklook]) -> Finding:
     if bright_frames.max() > SATURATED_RED or dark_frames.max() > DARK_RED:
         found = "red"
     most = 100.0 * saturated.mean(axis=0)[worst]
-    told = (
+    text = (
         f"{100.0 * bright_frames.mean():.2g} % of the frames' values are saturated"
         f"{f' (most at {wavelengths_nm[worst]:.0f} nm: {most:.2g} %)' if most else ''}, "
         f"{100.0 * dark_frames.mean():.2g} % are dark"
     )
     if bright_frames.max() > SATURATED_AMBER:
-        told += f"; the brightest frame is {quicklooks[int(bright_frames.argmax())].name}, expose shorter"
+        text += f"; the brightest frame is {quicklooks[int(bright_frames.argmax())].name}, expose shorter"
     elif dark_frames.max() > DARK_AMBER:
-        told += f"; the darkest frame is {quicklooks[int(dark_frames.argmax())].name}, expose longer"
+        text += f"; the darkest frame is {quicklooks[int(dark_frames.argmax())].name}, expose longer"
     values = {
         "saturation_counts": level,
         "saturated_fraction_by_frame": _by_name(quicklooks, bright_frames),
@@ -227,7 +226,7 @@ def _exposure(session: Session, quicklooks: Sequence[Quicklook]) -> Finding:
         "saturated_fraction_by_band": saturated.mean(axis=0).round(5).tolist(),
         "dark_fraction_by_band": dark.mean(axis=0).round(5).tolist(),
     }
-    return Finding("exposure", found, f"{session.path}: {told}." if found == "red" else f"Exposure: {told}.", values)
+    return Finding("exposure", found, f"{session.path}: {text}." if found == "red" else f"Exposure: {text}.", values)
 
 
 def _focus(session: Session, quicklooks: Sequence[Quicklook]) -> Finding:
@@ -246,14 +245,14 @@ def _copies(session: Session, quicklooks: Sequence[Quicklook]) -> Finding:
     copies = [(first, q.name) for q in quicklooks if (first := first_of.setdefault(q.digest, q.name)) != q.name]
     if not copies:
         return Finding("copies", "green", "No frame is a copy of another.")
-    told = ", ".join(f"{copy} is a copy of {first}" for first, copy in copies[:4])
-    sentence = f"{session.path}: {told}; leave copies out with {leave_out([copy for _, copy in copies])}."
+    text = ", ".join(f"{copy} is a copy of {first}" for first, copy in copies[:4])
+    sentence = f"{session.path}: {text}; leave copies out with {leave_out([copy for _, copy in copies])}."
     return Finding("copies", "red", sentence, {"copies": [list(pair) for pair in copies]})
 
 
 def _other_object(session: Session, quicklooks: Sequence[Quicklook], detections: Sequence[Detections]) -> Finding:
     if len(quicklooks) < FEWEST_COMPARED:
-        return Finding("other-object", "green", "There are too few frames to tell another object from a turn.")
+        return Finding("other-object", "green", "There are too few frames to recognise another object.")
     ratios = deviations([q.picture for q in quicklooks])
     seen = [set(found) for found in detections]
     strangers = [
@@ -266,7 +265,7 @@ def _other_object(session: Session, quicklooks: Sequence[Quicklook], detections:
     values = {"deviation_over_median": _by_name(quicklooks, ratios), "unknown_markers": strangers}
     wrong = [q.name for q in quicklooks if q.name in {*different, *strangers}]
     if wrong:
-        why = "unlike all other frames" if different else "other markers than in all other frames"
+        why = "unlike all other frames" if different else "markers that no other frame shows"
         sentence = (
             f"{session.path}: {why} (another object, or a moved camera): {names_in_short(wrong)}; leave out with "
             f"{leave_out(wrong)}."

@@ -13,8 +13,7 @@ import numpy as np
 from matplotlib import rc_context
 
 from hsi_sc_nerf.calibration.calibration_checks import check_white
-from hsi_sc_nerf.calibration.dark_checks import check_dark
-from hsi_sc_nerf.calibration.line_checks import check_lines
+from hsi_sc_nerf.calibration.reference_checks import check_dark, check_lines
 from hsi_sc_nerf.calibration.white_source import WhiteSource
 from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.capture.session_info import SessionInfo
@@ -25,7 +24,7 @@ from hsi_sc_nerf.inspection.marker_checks import Markers, check_markers, find_ma
 from hsi_sc_nerf.inspection.paper_check import check_paper
 from hsi_sc_nerf.inspection.quicklook import Quicklook, quicklooks_of
 from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure, show_image
-from hsi_sc_nerf.poses.feature_poses import known_angles_deg
+from hsi_sc_nerf.poses.feature_poses import known_angles_deg, required_angles_deg
 from hsi_sc_nerf.poses.pose_methods import PoseMethod
 
 WHOLE_TURN_DEG = 0.05
@@ -42,7 +41,7 @@ class Inspection:
     Attributes:
         session: the session, with the rotation of its images as measured.
         quicklooks: of each frame.
-        markers: what is seen of markers.
+        markers: the markers of the frames.
         findings: results of all checks.
         session_json: content of ``session.json`` with what could be measured filled in; None for what is not known.
     """
@@ -76,7 +75,7 @@ def inspect_session(
         poses: how poses will be found; without a scale, "auto" and "markers" are red.
         scale_known: whether something beside ``session.json`` gives the scale.
         white_source: where the white is.
-        skip_damaged: whether the user has chosen to do without damaged captures.
+        skip_damaged: whether the user leaves damaged captures out.
 
     Raises:
         InputError: the session does not have that source of white, or a cube cannot be read.
@@ -110,10 +109,9 @@ def _upright(session: Session, markers: Markers) -> tuple[Session, Finding]:
     values = {"stated_deg": session.info.image_rotation_deg, "measured_deg": measured}
     assumed = session.image_rotation_deg
     if measured is None:
-        source = "session.json" if session.info.image_rotation_deg is not None else "the instrument's habit"
-        return session, Finding(
-            "upright", "green", f"Upright: images are rotated by {assumed} degrees by {source}.", values
-        )
+        source = "session.json" if session.info.image_rotation_deg is not None else "the instrument's default"
+        sentence = f"Upright: images are rotated by {assumed} degrees, according to {source}."
+        return session, Finding("upright", "green", sentence, values)
     if session.info.image_rotation_deg is not None and measured != assumed:
         sentence = (
             f"{session.info_path}: states image_rotation_deg {assumed}, but by the markers it is {measured}; correct "
@@ -147,12 +145,14 @@ def filled_in(session: Session, markers: Markers) -> dict[str, object]:
 def suggestion(session: Session, content: dict[str, object]) -> str:
     """Lines that show a ``session.json`` to copy."""
     missing = [key for key, value in content.items() if value is None]
-    ask = f" with {', '.join(missing)} in the place of null" if missing else ""
-    return f"This is what the frames show; write it to {session.info_path}{ask}:\n{json.dumps(content, indent=2)}"
+    fill_in = f", with values of {', '.join(missing)} instead of null" if missing else ""
+    return (
+        f"The frames show the following; write it to {session.info_path}{fill_in}:\n{json.dumps(content, indent=2)}"
+    )
 
 
 def check_scale(session: Session, poses: PoseMethod, scale_known: bool) -> Finding:
-    """The finding ``scale``: whether anything gives the size of what is seen.
+    """The finding ``scale``: whether anything gives the scale.
 
     Args:
         session: the session.
@@ -171,22 +171,19 @@ def check_scale(session: Session, poses: PoseMethod, scale_known: bool) -> Findi
     where = f"{session.info_path}: does not give" if session.info_path.is_file() else f"{session.path}: nothing gives"
     sentence = (
         f"{where} a scale; state marker_side_m, the side of a marker's black square in metres, in session.json or "
-        "by --marker-side-m, or do without a scale by --poses colmap."
+        "by --marker-side-m, or go on without a scale by --poses colmap."
     )
     return Finding("scale", "red" if poses in ("auto", "markers") else "amber", sentence)
 
 
 def check_angles(session: Session, poses: PoseMethod, markers: Markers) -> list[Finding]:
-    """The finding ``angles`` where ``session.json`` states angles that cannot be used, or none that are needed."""
+    """The finding ``angles`` if those of ``session.json`` cannot be used, or are needed and missing."""
     needed = poses == "angles" or (poses == "auto" and markers.dictionary is None)
     try:
-        angles_deg = known_angles_deg(session.info, len(session.frames))
+        (required_angles_deg if poses == "angles" else known_angles_deg)(session.info, len(session.frames))
     except InputError as error:
         return [Finding("angles", "red" if needed else "amber", f"{session.info_path}: {error}.")]
-    if angles_deg is not None or poses != "angles":
-        return []
-    sentence = f"{session.info_path}: the angles are not known; give nominal_step_deg or frame_angles_deg."
-    return [Finding("angles", "red", sentence)]
+    return []
 
 
 def draw_inspection(inspection: Inspection, path: Path) -> None:

@@ -1,7 +1,7 @@
-"""Checks of the markers: how many are seen, how far the table turned, and what poses to expect of them.
+"""Checks of the markers: how many are detected, how far the table turned, and how accurate poses from them will be.
 
-The first guess of the poses, from markers as they are detected, tells how the table turned and which way up images
-are.
+A first estimate of the poses, from markers as they are detected, gives the turn of the table and the images' rotation
+from upright.
 """
 
 from __future__ import annotations
@@ -25,40 +25,40 @@ from hsi_sc_nerf.poses.model_selection import usable
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, MarkerObservations
 
 LEAST_NOISE = 1e-4
-"""Reflectance; no smaller noise is told."""
+"""Smallest noise of the reflectance that is stated."""
 FITTED_MARKERS = 5
-"""Markers whose corners are fitted; they give their error."""
+"""Number of markers whose corners are fitted, to estimate the corners' error."""
 MIRRORED_FRAMES, MORE_IN_MIRROR = 6, 2
-"""Frames in whose mirror images markers are looked for, where the images themselves tell no turn; and how many times
-as many markers they must show."""
+"""Number of frames whose mirror images are searched for markers if the images themselves show no turn, and the factor
+by which the mirror images must show more markers."""
 EXPECTED = ((20.0, 0.03, 0.5), (10.0, 0.06, 0.5), (8.0, 0.3, 5.0))
 """Smallest side of a marker in px, and the largest error of poses in degrees and mm that simulated sessions with such
 markers have (docs/validation/poses.md). Smaller markers are refused."""
 STOOD_STILL = 0.2
-"""The table stood still where it turned by less than this fraction of the usual step."""
+"""The table did not turn if it turned by less than this fraction of the usual step."""
 LARGE_GAP = 1.7
 """A step counts as a gap from this factor of the usual step, which unevenness does not reach."""
 LEAST_TURN_DEG = 20.0
-"""Circles of which less is seen do not tell where their axis is."""
+"""Shorter arcs of the markers' circles do not determine the axis."""
 LOOKS_DOWN_DEG = (5.0, 85.0)
-"""Neither a turntable seen from its side nor one seen from above shows which way up the image is."""
+"""Elevations of the camera at which the turntable shows which way up the image is: not at its side or above it."""
 LARGEST_ROLL_DEG = 30.0
-"""The camera's roll may add so much to a quarter turn."""
+"""Largest roll of the camera beside a quarter turn."""
 
 
 @dataclass(frozen=True, eq=False)
 class Markers:
-    """What is seen of markers.
+    """The markers of a session.
 
     Attributes:
-        dictionary: that they come from; None if no marker is seen.
+        dictionary: of the markers; None if no marker was detected.
         detections: markers of each frame.
         angles_deg: the table's angle by frame, counter-clockwise from above; nan where it is not known.
-        rotation_deg: rotation of the files' images from upright, counter-clockwise: 0, 90, 180 or 270; None where the
-            markers do not tell.
+        rotation_deg: rotation of the files' images from upright, counter-clockwise: 0, 90, 180 or 270; None if the
+            markers do not determine it.
         side_px: median side of a marker; nan without any.
         corner_error_px: standard deviation of a fitted corner; nan where none could be fitted.
-        mirrored: whether markers are seen in the images' mirror images only.
+        mirrored: whether markers are detected only in the images' mirror images.
     """
 
     dictionary: str | None
@@ -121,7 +121,7 @@ def find_markers(session: Session, quicklooks: Sequence[Quicklook]) -> Markers:
 def _seen_in_mirror(
     grays: Sequence[UInt8[np.ndarray, "h w"]], detections: Sequence[Detections], dictionary: str | None
 ) -> bool:
-    """Whether frames show far more markers when they are mirrored; without, some cells are misread for markers."""
+    """Whether frames show far more markers when they are mirrored; a few may be misread cells."""
     chosen = np.unique(np.linspace(0, len(grays) - 1, MIRRORED_FRAMES).astype(int)).tolist()
     mirrored = [np.ascontiguousarray(grays[index][:, ::-1]) for index in chosen]
     dictionary = dictionary or find_dictionary(mirrored)
@@ -139,8 +139,8 @@ def check_markers(session: Session, markers: Markers) -> list[Finding]:
 
 def _mirrored(session: Session) -> Finding:
     sentence = (
-        f"{session.path}: the images are mirrored, for their markers can be read in a mirror only, and the object "
-        "would become its mirror image; export the cubes without flipping their lines or samples."
+        f"{session.path}: the images are mirrored: their markers can be read only in a mirror, and the model would "
+        "be the object's mirror image; export the cubes without flipping their lines or samples."
     )
     return Finding("mirrored", "red", sentence)
 
@@ -157,18 +157,18 @@ def _seen(session: Session, markers: Markers) -> Finding:
     if markers.dictionary is None:
         stated = session.info.marker_dictionary
         of = f"of {stated}" if stated else "of the usual dictionaries"
-        sentence = f"No marker {of} is seen; without markers poses need texture or known angles, and a scale."
+        sentence = f"No marker {of} was detected; without markers, poses need texture or known angles, and a scale."
         return Finding("markers", "amber", sentence, values)
-    told = f"{np.median(numbers):g} markers of {markers.dictionary} a frame, {markers.side_px:.0f} px wide"
+    text = f"{np.median(numbers):g} markers of {markers.dictionary} a frame, {markers.side_px:.0f} px wide"
     if np.isfinite(markers.corner_error_px):
-        told += f", corners known to {markers.corner_error_px:.2g} px"
+        text += f", with a corner error of {markers.corner_error_px:.2g} px"
     without = [name for name, number in zip(names, numbers, strict=True) if number == 0]
     level: Level = "green"
     if without:
-        level, told = "amber", f"{told}; none is seen in {names_in_short(without)}, which will be left out"
+        level, text = "amber", f"{text}; none was detected in {names_in_short(without)}, which will be left out"
     elif np.median(numbers) < 2 or markers.side_px < EXPECTED[-1][0]:
-        level, told = "amber", f"{told}; show more or larger ones"
-    return Finding("markers", level, f"Markers: {told}.", values)
+        level, text = "amber", f"{text}; show more or larger ones"
+    return Finding("markers", level, f"Markers: {text}.", values)
 
 
 def _turn(session: Session, markers: Markers) -> Finding:
@@ -192,7 +192,7 @@ def _turn(session: Session, markers: Markers) -> Finding:
             for name, a in zip(names, markers.angles_deg, strict=True)
         },
     }
-    told = f"steps of {abs(step):.3g} degrees {direction}"
+    text = f"steps of {abs(step):.3g} degrees {direction}"
     stated = session.info.direction
     if stated is not None and stated != direction:
         sentence = (
@@ -207,10 +207,10 @@ def _turn(session: Session, markers: Markers) -> Finding:
     if still:
         faults.append(f"the table did not turn from {names_in_short(still, 3)}")
     if gaps[gap] > LARGE_GAP * abs(step) + 2.0:
-        faults.append(f"{gaps[gap]:.0f} degrees of the turn are not shown, from {ordered[gap]:.0f} degrees on")
+        faults.append(f"no frame shows {gaps[gap]:.0f} degrees of the turn, from {ordered[gap]:.0f} degrees on")
     if faults:
-        return Finding("turn", "amber", f"Turn: {told}, but {' and '.join(faults)}.", values)
-    return Finding("turn", "green", f"Turn: {told}, a whole turn.", values)
+        return Finding("turn", "amber", f"Turn: {text}, but {' and '.join(faults)}.", values)
+    return Finding("turn", "green", f"Turn: {text}, a whole turn.", values)
 
 
 def _expected(session: Session, markers: Markers) -> Finding:
@@ -220,7 +220,7 @@ def _expected(session: Session, markers: Markers) -> Finding:
         "two frames"
     )
     if markers.dictionary is None:
-        poses = "what poses are worth is not known without markers"
+        poses = "without markers the accuracy of poses is not known in advance"
     elif np.median([len(seen) for seen in markers.detections]) == 0 or markers.side_px < EXPECTED[-1][0]:
         poses = "markers of less than 8 px give no usable poses"
     else:
@@ -229,7 +229,9 @@ def _expected(session: Session, markers: Markers) -> Finding:
             f"simulated sessions with such markers have poses within {rotation_deg:g} degrees and {position_mm:g} mm "
             "(docs/validation/poses.md)"
         )
-    return Finding("expected-accuracy", "green", f"To expect: {poses}; {spectra}.", {"reflectance_noise": noise})
+    return Finding(
+        "expected-accuracy", "green", f"Expected accuracy: {poses}; {spectra}.", {"reflectance_noise": noise}
+    )
 
 
 def turn_and_rotation_deg(
@@ -244,7 +246,7 @@ def turn_and_rotation_deg(
     Returns:
         Degrees relative to the first frame that has an angle, counter-clockwise seen from above, nan where markers do
         not link a frame to most others; and the rotation, counter-clockwise: 0, 90, 180 or 270 degrees, None where
-        the markers do not tell.
+        the markers do not determine it.
     """
     seen = [(frame, *marker) for frame, found in enumerate(detections) for marker in sorted(found.items())]
     unknown = np.full(len(detections), np.nan)
@@ -262,9 +264,9 @@ def turn_and_rotation_deg(
     angles_deg = turntable.over_session(turntable.relative_angles_deg(), len(detections))
     if np.nanmax(angles_deg) - np.nanmin(angles_deg) < LEAST_TURN_DEG:
         return unknown, None
-    right, down, away = turntable.camera_rotation[:, 2]
+    right, down, forward = turntable.camera_rotation[:, 2]
     roll_deg = np.rad2deg(np.arctan2(-down, right)) - 90.0
     nearest = 90 * round(roll_deg / 90.0)
-    looks_down = LOOKS_DOWN_DEG[0] < np.rad2deg(np.arcsin(np.clip(-away, -1.0, 1.0))) < LOOKS_DOWN_DEG[1]
+    looks_down = LOOKS_DOWN_DEG[0] < np.rad2deg(np.arcsin(np.clip(-forward, -1.0, 1.0))) < LOOKS_DOWN_DEG[1]
     is_clear = looks_down and abs(roll_deg - nearest) <= LARGEST_ROLL_DEG
     return angles_deg, nearest % 360 if is_clear else None

@@ -1,4 +1,4 @@
-"""Is reflectance of the right size, and black black? The markers tell: paper and ink, whatever the object is."""
+"""Checks of the reflectance on the markers: their paper and ink have a known range, whatever the object is."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from hsi_sc_nerf.spectra import nearest_bands
 PAPER_PERCENTILE = 85.0
 """About half of a marker is white, some of it blurred with black."""
 LEAST_SIDE_PX = 10.0
-"""Of smaller markers no pixel shows paper alone."""
+"""In smaller markers, no pixel shows paper alone."""
 USUAL, POSSIBLE = (0.3, 1.15), (0.1, 2.0)
-"""Ranges of the paper's reflectance: paper that lies before lamps from above has 0.4 to 1, in shade less."""
+"""Ranges of the paper's reflectance: 0.4 to 1 under lamps from above, less in shade."""
 INK_PERCENTILE, BLACKEST_MARKERS = 2.0, 25.0
-"""Blur brightens black cells, those that stand alone and those of small markers most."""
+"""Blur brightens black cells, most of all single ones and those of small markers."""
 VEIL_AMBER, VEIL_RED = 0.15, 0.2
-"""Ink's brightness over that of the paper. Printed black has 0.04 to 0.1."""
+"""Brightness of the ink relative to the paper; 0.04 to 0.1 for printed black."""
 
 
 def check_paper(session: Session, quicklooks: Sequence[Quicklook], detections: Sequence[Detections]) -> list[Finding]:
@@ -51,7 +51,7 @@ def check_paper(session: Session, quicklooks: Sequence[Quicklook], detections: S
         return []
     ink, paper = np.array(found).T
     of_paper = [] if session.white is None else [_of_paper(session, float(np.median(paper)), len(found))]
-    # Of few and far markers blur tells more than light does.
+    # In few and distant markers, blur matters more than stray light.
     if len(found) < len(session.frames):
         return of_paper
     ratio = float(np.percentile(ink / np.maximum(paper, 1e-6), BLACKEST_MARKERS))
@@ -68,9 +68,9 @@ def _of_paper(session: Session, paper: float, markers: int) -> Finding:
         return Finding("paper", "green", f"Paper: {text}.", values)
     level: Level = "amber" if POSSIBLE[0] <= paper <= POSSIBLE[1] else "red"
     sentence = (
-        f"{session.path}: {text}, so that all reflectances are probably too {'low' if paper < 1.0 else 'high'}; "
-        "check that the white is white (else name its panel_reflectance), in the frames' light, and of the "
-        "integration time that its header states."
+        f"{session.path}: {text}, so all reflectances are probably too {'low' if paper < 1.0 else 'high'}; check "
+        "that the white is white (otherwise give its panel_reflectance), that it was taken under the frames' light, "
+        "and that its header states the right integration time."
     )
     return Finding("paper", level, sentence, values)
 
@@ -79,7 +79,7 @@ def _veil(session: Session, ink: float, markers: int) -> Finding:
     sentence = f"{session.path}: the markers' black is {100.0 * ink:.0f} % as bright as their white"
     advice = (
         "stray light lies over the frames and adds to every reflectance (a lamp in view, a dirty lens or window, an "
-        "open chamber), unless the print is grey or blurred; shade the lens, or print the markers anew"
+        "open chamber), unless the print is grey or blurred; shade the lens, or print the markers again"
     )
     finding = judged("veil", ink, (VEIL_AMBER, VEIL_RED), sentence, advice)
     return replace(finding, values={**finding.values, "markers": markers})

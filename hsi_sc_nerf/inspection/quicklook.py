@@ -1,4 +1,4 @@
-"""Quicklooks: what each frame shows: a few bands of all lines, and all bands of a few lines."""
+"""Quicklooks: a few bands of all lines, and all bands of a few lines, of each frame."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from hsi_sc_nerf.calibration.detector import (
     some_lines,
     spread_rows,
 )
-from hsi_sc_nerf.calibration.line_checks import bright_pixels
+from hsi_sc_nerf.calibration.reference_checks import bright_pixels
 from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.poses.session_pictures import edge_slope
 from hsi_sc_nerf.spectra import nearest_bands, to_8_bit
@@ -31,7 +31,7 @@ from hsi_sc_nerf.spectra import nearest_bands, to_8_bit
 PICTURE_NM = (640.0, 550.0, 470.0)
 """Red, green and blue of the pictures; markers' inks are dark in all of them."""
 NEIGHBOURS = 2
-"""So many neighbouring bands make one channel of a picture: they lie side by side in the file."""
+"""Number of neighbouring bands averaged into a channel of a picture; they lie side by side in the file."""
 DARK_SIGMAS = 3.0
 """A value is dark if it exceeds the dark cube by less than this many standard deviations."""
 WORKERS = 2
@@ -39,14 +39,14 @@ WORKERS = 2
 
 @dataclass(frozen=True, eq=False)
 class Quicklook:
-    """What a capture shows by a few of its lines and bands. Pictures lie as in the file.
+    """A capture by a few of its lines and bands. Pictures are oriented as in the file.
 
     Attributes:
         name: of the capture.
         picture: pseudo-RGB, about 1 on white.
         top_counts: the largest reading of the lines read.
         at_top_fraction: fraction of the readings with ``top_counts``, by band.
-        dark_fraction: fraction of the readings that are no light, by band.
+        dark_fraction: fraction of the readings without light, by band.
         sharpness_per_px: mean slope of the strongest edges over the picture's contrast.
         digest: hash of the readings; equal for copies only.
         dark_spectrum: mean counts of the dark reference; None without one.
@@ -65,7 +65,7 @@ class Quicklook:
 
     @property
     def gray(self) -> UInt8[np.ndarray, "lines samples"]:
-        """Mean of the picture's channels, in which markers are looked for."""
+        """Mean of the picture's channels, which is searched for markers."""
         return to_8_bit(self.picture.mean(axis=-1))
 
 
@@ -117,12 +117,12 @@ def quicklook_of(capture: Capture, white: Float[np.ndarray, "bands"]) -> Quicklo
 
 
 def white_level(session: Session) -> Float[np.ndarray, "bands"]:
-    """Counts above dark of the session's white by band, or of what is brightest in the first frame without one."""
+    """Counts above dark of the session's white by band; without a white, those of the brightest part of a frame."""
     return white_counts(session.frames[0] if session.white is None else session.white)
 
 
 def white_counts(capture: Capture) -> Float[np.ndarray, "bands"]:
-    """Counts above dark of what is brightest in a capture, by band."""
+    """Counts above dark of the brightest part of a capture, by band."""
     level = np.percentile(light_of_some_lines(capture.cube, capture.dark), 95.0, axis=(0, 1))
     return np.maximum(level, 1e-3 * max(float(level.max()), 1e-9))
 
@@ -130,8 +130,8 @@ def white_counts(capture: Capture) -> Float[np.ndarray, "bands"]:
 def reflectance_noise(session: Session) -> float:
     """Upper limit of the standard deviation of one value's reflectance, the median over the bands.
 
-    It is measured between the first two frames. A change of the lamps does not count; what turns does, so that the
-    limit is 1.3 times the noise where a third of the picture turns, and twice where half does.
+    It is measured between the first two frames. Changes of the lamps do not contribute. Moving parts do: the limit is
+    1.3 times the noise if a third of the picture turns, and twice the noise if half does.
     """
     first, second = (light_of_some_lines(frame.cube, frame.dark) for frame in session.frames[:2])
     change = (second - first) / white_level(session)

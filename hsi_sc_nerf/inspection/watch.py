@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from hsi_sc_nerf.calibration.detector import DIGITISER_LIMITS
 from hsi_sc_nerf.capture.instrument import CaptureFiles, list_captures
-from hsi_sc_nerf.capture.session import SESSION_INFO_NAME, Capture, open_captures
-from hsi_sc_nerf.capture.session_info import SessionInfo, read_session_info
+from hsi_sc_nerf.capture.session import Capture, open_captures
+from hsi_sc_nerf.capture.session_info import SESSION_INFO_NAME, SessionInfo, read_session_info
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.inspection.capture_checks import BLURRED, DARK_RED, SATURATED_RED, acquisition_day
 from hsi_sc_nerf.inspection.quicklook import Quicklook, quicklook_of, white_counts
@@ -19,14 +20,14 @@ FEWEST_TO_COMPARE = 3
 
 
 class Watch:
-    """A session's folder that is looked at again and again.
+    """Follows a session's folder while captures are added to it.
 
     Args:
         path: the session's folder; it may be empty.
 
     Attributes:
-        captures: number of captures that a line was given for.
-        flagged: those of them with something wrong.
+        captures: number of captures that were reported.
+        flagged: names of those with a fault.
         incomplete: why other captures cannot be read, by name.
     """
 
@@ -38,7 +39,7 @@ class Watch:
         self._seen: set[str] = set()
         self._quicklooks: list[Quicklook] = []
         self._markers: list[int] = []
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self._info = SessionInfo()
         self._first: Capture | None = None
         self._dictionary: str | None = None
@@ -46,8 +47,8 @@ class Watch:
     def new_lines(self) -> list[str]:
         """A line for each capture that is complete and was not before.
 
-        A capture whose data file is shorter than its header says is still being written, and is waited for. A line
-        says so if another capture that came later is complete, and if ``session.json`` or the folder cannot be used.
+        A capture whose data file is shorter than its header states is still being written, and is read later. It is
+        reported if a later capture is complete, and so is a ``session.json`` or folder that cannot be used.
         """
         waited_for, self.incomplete = self.incomplete, {}
         lines = []
@@ -74,10 +75,10 @@ class Watch:
         return lines
 
     def _once(self, line: str) -> list[str]:
-        """The line, unless it was told before."""
-        told = line in self._told
-        self._told.add(line)
-        return [] if told else [line]
+        """The line, unless it was reported before."""
+        reported = line in self._reported
+        self._reported.add(line)
+        return [] if reported else [line]
 
     def _is_complete(self, files: CaptureFiles) -> bool:
         """Whether the dark cube, which a SPECIM IQ writes beside the counts, is there if earlier captures had one."""
@@ -85,7 +86,7 @@ class Watch:
 
     def _line(self, capture: Capture, dictionary: str | None, is_white: bool) -> str:
         quicklook = quicklook_of(capture, white_counts(capture))
-        saturated = float(quicklook.at_top_fraction.mean()) if _is_full_scale(quicklook.top_counts) else 0.0
+        saturated = float(quicklook.at_top_fraction.mean()) if quicklook.top_counts in DIGITISER_LIMITS else 0.0
         dark = float(quicklook.dark_fraction.mean())
         parts = [f"saturated {100.0 * saturated:.1f} %", f"dark {100.0 * dark:.1f} %"]
         faults = []
@@ -121,8 +122,3 @@ class Watch:
         self._quicklooks.append(quicklook)
         self._markers.append(markers)
         return faults
-
-
-def _is_full_scale(top_counts: float) -> bool:
-    """Whether the largest reading is the limit of a digitiser of 8 to 16 bits."""
-    return top_counts in {2.0**bits - 1.0 for bits in range(8, 17)}

@@ -1,1 +1,1 @@
-"""Light on the object, told apart from the material because the light stands still and the object turns."""
+"""Light on the object, separated from its material: the light is stationary while the object turns."""

@@ -1,4 +1,4 @@
-"""Elements: points that stand for a surface's parts, on the object and on what it stands on; which frames see them.
+"""Elements: points that represent parts of a surface, on the object and its support, and which frames see them.
 
 Lengths are metres in the object frame.
 """
@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.evaluation.spatial import sample_surface
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, unit_vectors
+from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene, unoccluded
 from hsi_sc_nerf.geometry.ray_projection import image_coordinates
 from hsi_sc_nerf.light.views import Views
 
@@ -25,14 +25,14 @@ SUPPORT_SIDES = 25
 POINTS_EACH = 4
 """Points of the object's surface for each of its elements; a pixel shows several times as many."""
 NORMAL_WEIGHT = 2.0
-"""A triangle belongs to the nearest element; a right angle between normals counts like so many spacings."""
+"""A triangle belongs to the nearest element; a right angle between normals counts as this many spacings."""
 LARGEST_INCIDENCE_DEG, LARGEST_INCIDENCE_OF_SUPPORT_DEG = 70.0, 80.0
-"""More oblique pixels also hold what lies beside. The lid is seen obliquely by every camera."""
+"""More oblique pixels also cover neighbouring parts. Every camera sees the lid obliquely."""
 
 SMALLEST = 1e-3
 """Reflectance that noise does not exceed."""
 MISPLACED_PX = 0.3
-"""Poses, surface and interpolation are uncertain by this part of a pixel."""
+"""Poses, surface and interpolation are uncertain by this fraction of a pixel."""
 
 Pixels = Callable[[int, Int[np.ndarray, "n"], Int[np.ndarray, "n"]], Float[np.ndarray, "n bands"]]
 """Reflectance of pixels of a frame, given by line and sample; NaN where nothing was measured."""
@@ -62,7 +62,7 @@ def spread_elements(scanned: Mesh, support: Mesh, on_object: int, on_support: in
 
     Args:
         scanned: the object's mesh, with or without holes.
-        support: what it stands on (`support_mesh`); may have no triangles.
+        support: the surface under the object (`support_mesh`); may have no triangles.
         on_object: elements of the object.
         on_support: elements of the support.
         smoothing_m: normals of the object are means over this radius: about a pixel, which shows no more.
@@ -87,12 +87,12 @@ def spread_elements(scanned: Mesh, support: Mesh, on_object: int, on_support: in
 def shown_points(
     elements: Elements, radius_m: float, lift_m: float
 ) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"], scipy.sparse.csr_array]:
-    """Points that pixels show of the elements: kernels of an ear shade each other and have normals of their own.
+    """Points of the elements that pixels show: kernels of an ear shade each other and have normals of their own.
 
     Args:
         elements: of the object and its support, which is smooth.
         radius_m: points lie within this of their element.
-        lift_m: lines of sight begin so far outside of the surface.
+        lift_m: distance of the origins of lines of sight from the surface.
 
     Returns:
         Points, outward unit normals, and the weight of each in each element as seen along its normal.
@@ -101,8 +101,7 @@ def shown_points(
     scanned = Mesh(whole.vertices, whole.triangles[elements.on_object[elements.of_triangle]])
     points = sample_surface(scanned.vertices, scanned.triangles, POINTS_EACH * int(elements.on_object.sum()))
     facets = ray_scene(scanned.vertices, scanned.triangles).compute_closest_points(points.astype(np.float32))
-    normals = facets["primitive_normals"].numpy().astype(float)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    normals = unit_vectors(facets["primitive_normals"].numpy().astype(float))
     near = cKDTree(points).query_ball_point(elements.positions, radius_m)
     element = np.repeat(np.arange(count), [len(some) for some in near])
     point = np.concatenate([np.asarray(some, int) for some in near])
@@ -110,11 +109,11 @@ def shown_points(
     kept = elements.on_object[element] & (cosine > 0.0)
     shape = count, len(points)
     weights = scipy.sparse.csr_array((cosine[kept], (element[kept], point[kept])), shape=shape)
-    # What lies in a groove is hidden to one who looks along the mean normal of the elements around.
-    sight = np.concatenate([points + lift_m * normals, weights.T @ elements.normals], axis=1, dtype=np.float32)
-    hidden = ray_scene(whole.vertices, whole.triangles).test_occlusions(sight).numpy()
-    weights = weights @ scipy.sparse.diags_array(1.0 - hidden)
-    # An element that is left without a point, and those of the support, stand for themselves.
+    # A point in a groove is hidden from a viewer along the mean normal of the surrounding elements.
+    scene = ray_scene(whole.vertices, whole.triangles)
+    visible = unoccluded(scene, points + lift_m * normals, weights.T @ elements.normals)
+    weights = weights @ scipy.sparse.diags_array(visible.astype(float))
+    # Elements without a point, and those of the support, represent themselves.
     alone = weights.sum(axis=1) <= 0.0
     weights = scipy.sparse.hstack([weights, scipy.sparse.diags_array(alone.astype(float))], format="csr")
     weights.eliminate_zeros()
@@ -131,7 +130,7 @@ def smooth_normals(mesh: Mesh, positions: Float[np.ndarray, "n 3"], radius_m: fl
     sums = np.empty((len(positions), 3))
     for row, near in enumerate(tree.query_ball_point(positions, radius_m)):
         sums[row] = vertices[near].sum(axis=0) if near else vertices[nearest[row]]
-    return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-30)
+    return unit_vectors(sums)
 
 
 def _nearest(
@@ -184,9 +183,9 @@ def observe(
     pixels: Pixels,
     lift_m: float,
 ) -> Views:
-    """What frames measure of the elements that they see, interpolated between four pixels.
+    """Measurements of the visible elements in the frames, interpolated between four pixels.
 
-    All four pixels are the object's, or none is.
+    Either all four pixels belong to the object or none does.
 
     Args:
         elements: on the object and its support.
@@ -195,7 +194,7 @@ def observe(
         distortion: k1, k2, p1, p2 (OpenCV).
         masks: pixels of the object.
         pixels: reads reflectance.
-        lift_m: lines of sight begin so far outside of the surface.
+        lift_m: distance of the origins of lines of sight from the surface.
     """
     scene = ray_scene(elements.occluders.vertices, elements.occluders.triangles)
     starts = elements.positions + lift_m * elements.normals
@@ -203,16 +202,14 @@ def observe(
     least = np.cos(np.deg2rad(least))
     found: list[tuple[np.ndarray, ...]] = []
     for frame, pose in enumerate(camera_to_world):
-        sight = pose[:3, 3] - elements.positions
-        sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+        sight = unit_vectors(pose[:3, 3] - elements.positions)
         in_camera = torch.from_numpy((elements.positions - pose[:3, 3]) @ pose[:3, :3])
         xy, forward = image_coordinates(in_camera, intrinsics, distortion)
         # Pixel centres lie at half numbers.
         corner = np.floor(xy.numpy() - 0.5)
         inside = (corner >= 0.0).all(axis=1) & (corner < [intrinsics.w - 1, intrinsics.h - 1]).all(axis=1)
         seen = np.flatnonzero((np.einsum("nk,nk->n", elements.normals, sight) > least) & inside & forward.numpy())
-        rays = np.concatenate([starts[seen], sight[seen]], axis=1, dtype=np.float32)
-        seen = seen[~scene.test_occlusions(rays).numpy()]
+        seen = seen[unoccluded(scene, starts[seen], sight[seen])]
         sample, line = corner[seen].astype(int).T
         part = xy.numpy()[seen] - 0.5 - corner[seen]
         value, of_object, across, along = 0.0, [], 0.0, 0.0

@@ -1,11 +1,12 @@
-"""The light and the materials that explain what all views measure of all elements.
+"""Fit of the light and the materials to the measurements of all elements in all views.
 
-An element of reflectance rho shows rho times its irradiance, which changes from view to view because it turns under
-a light that stands still; its material does not. The fit is Gauss-Newton with the materials eliminated (variable
-projection, Golub and Pereyra 1973), Tukey's weights against gloss, and measurements that weigh as much as they differ
-between parts of the surface (`SharedErrors`). Lamps are added one by one while the views call for them. A light that
-does not change with the turn shows in no view. It is known from what is expected: a nearly even chamber, few lamps,
-and irradiance 1 on the white reference.
+An element of reflectance rho has the radiance rho times its irradiance. Its irradiance changes from view to view,
+because the element turns under stationary light; its material does not change. The fit is Gauss-Newton with the
+materials eliminated (variable projection, Golub and Pereyra 1973), with Tukey's weights against gloss and weights
+from the scatter between parts of the surface (`SharedErrors`). Lamps are added one by one while they are significant.
+
+Light that does not change with the turn cannot be seen in the views. Prior knowledge determines it: a nearly even
+chamber, few lamps, and irradiance 1 on the white reference.
 """
 
 from __future__ import annotations
@@ -17,38 +18,40 @@ import scipy.sparse
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
+from hsi_sc_nerf.geometry.camera import unit_vectors
 from hsi_sc_nerf.light.shared_errors import CORRELATED, SMALLEST_SCATTER, SharedErrors, scatter_beyond, tukey_weights
-from hsi_sc_nerf.light.standing_light import (
+from hsi_sc_nerf.light.stationary_light import (
     DEGREE,
     TERMS,
-    StandingLight,
+    StationaryLight,
     even_directions,
     even_light,
     harmonic_degrees,
     tangents,
-    units_on,
+    unit_irradiance,
 )
 from hsi_sc_nerf.light.views import LampUnits, TurningElements, Views
 from hsi_sc_nerf.robust_scatter import robust_std
 
 MOST_LAMPS = 4
 CANDIDATES = 200
-"""Directions in which a lamp is looked for."""
+"""Number of directions in which a lamp is searched for."""
 BEHIND = -0.2
-"""Lamps stand on the camera's side: the cosine between their direction and the camera's is above this. By a body
-alone, a lamp before it and another behind it can hardly be told from one lamp and an uneven chamber."""
-CALLED_FOR = 30.0
-"""Squared standard deviations by which a lamp in one of 200 directions must exceed 0. On trained meshes one of 40 %
-of the light reaches 600, and what errors of mesh and model make look like another, 25."""
+"""Lamps stand on the camera's side: the cosine between their direction and the camera's is above this. Two lamps in
+front of and behind a body can hardly be distinguished from one lamp and an uneven chamber."""
+SIGNIFICANT_LAMP = 30.0
+"""Squared standard deviations by which a lamp in one of 200 directions must exceed 0. On trained meshes, a lamp with
+40 % of the light reaches 600, and errors of mesh and model that resemble another lamp reach 25."""
 LEAST_LAMP = 0.02
-"""Weaker lamps are none."""
+"""Weaker lamps are removed."""
 UNEVENNESS, UNEVENNESS_COUNT = 0.03, 2.0
-"""Expected root mean square of a chamber's harmonics, and how many harmonics this expectation is worth. Those that
-are seen tell what is to be expected of those that are not."""
+"""Expected root mean square of a chamber's harmonics, and the number of harmonics that this prior is worth. Visible
+harmonics update it for those that are not visible."""
 UNEVENNESS_AT_FIRST = 0.003
-"""Expected root mean square while a lamp is searched for, so that the chamber does not explain how near it is."""
+"""Expected root mean square while a lamp is searched for, so that the chamber does not explain the lamp's
+nearness."""
 MOST_UNEVEN = 0.1
-"""A chamber's harmonics are no larger: what is more uneven is a lamp."""
+"""Largest root mean square of a chamber's harmonics: light that is more uneven is a lamp's."""
 LEAST_DISTANCE_M = 0.25
 """Least distance of lamps; the first order of their nearness still describes it."""
 LAMP_STD, TURN_STD_RAD, NEARNESS_STD = 1.0, 1.0, 1.5
@@ -58,21 +61,20 @@ WHITE_STD = 0.01
 COLOUR_STD = 0.3
 """Expected scatter of the lamps' colour from the white reference's light."""
 LEAST_LAMPS = 0.05
-"""Lamps that give the white reference less than this part of its light have no colour of their own."""
+"""The lamps' colour is fitted if they give the white reference at least this fraction of its light."""
 OCCLUSION_ERROR = 0.1
-"""Error of irradiance relative to what neighbours take from it and give to it: meshes are uncertain where bodies
-touch."""
+"""Error of irradiance relative to the part that neighbours occlude: meshes are uncertain where bodies touch."""
 STEPS, LEAST_STEPS = 10, 3
 """Steps of Gauss-Newton for each number of lamps."""
 SETTLED = 0.01
-"""Squared standard deviations of a step that changes nothing any more."""
+"""Squared standard deviations of a step at which the fit has converged."""
 LARGEST_TURN_RAD = 0.2
 LEAST_IRRADIANCE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class LightFit:
-    """What the views say.
+    """The light and the materials that fit the views best.
 
     Attributes:
         light: in the camera's frame.
@@ -80,10 +82,10 @@ class LightFit:
         weights: Tukey's weight of each measurement, 0 to 1.
         irradiance: at each measurement.
         scatter: robust standard deviation of the measurements relative to the model.
-        relative_std: standard deviation of each measurement's irradiance, relative to it, as far as the light's is.
+        relative_std: relative standard deviation of each measurement's irradiance due to the light's uncertainty.
     """
 
-    light: StandingLight
+    light: StationaryLight
     material: Float[np.ndarray, "n bands"]
     weights: Float[np.ndarray, "m"]
     irradiance: Float[np.ndarray, "m bands"]
@@ -111,10 +113,10 @@ def fit_light(elements: TurningElements, views: Views, white_normal: Float[np.nd
         if fit.light.lamps.min() < LEAST_LAMP:
             fit.restore(before)
             break
-    # Only what no lamp explains is the chamber's.
+    # The chamber explains only what no lamp explains.
     fit.unevenness = UNEVENNESS
     fit.errors = SharedErrors(elements.cells[views.element], elements.facing(views))
-    fit.converge(see_unevenness=True)
+    fit.converge(estimate_unevenness=True)
     return fit.result()
 
 
@@ -150,8 +152,8 @@ class _Fit:
         for name, value in state.items():
             setattr(self, name, value)
 
-    def converge(self, *, see_unevenness: bool = False) -> None:
-        """Gauss-Newton with so many lamps as there are; the chamber's unevenness is found as well if so."""
+    def converge(self, *, estimate_unevenness: bool = False) -> None:
+        """Gauss-Newton with the present lamps; the chamber's unevenness is estimated as well if asked for."""
         for number in range(STEPS):
             self._bounce()
             residual, jacobian = self._linearised()
@@ -162,14 +164,14 @@ class _Fit:
             hessian = information + prior
             step = np.linalg.solve(hessian, known + pull)
             self._move(step)
-            if see_unevenness:
-                self._see_unevenness(np.linalg.inv(hessian))
-            self._see_colours()
+            if estimate_unevenness:
+                self._estimate_unevenness(np.linalg.inv(hessian))
+            self._estimate_colours()
             if number + 1 >= LEAST_STEPS and step @ hessian @ step < SETTLED:
                 break
 
     def add_lamp(self) -> bool:
-        """Add the lamp that explains most of what is left; False if no direction holds one."""
+        """Add the lamp that explains most of the residuals; False if none is significant."""
         self._bounce()
         directions = even_directions(CANDIDATES)
         directions = directions[directions[:, 2] > BEHIND]
@@ -178,14 +180,14 @@ class _Fit:
         expected = 1.0 / self.irradiance().mean(axis=1, keepdims=True)
         residual, columns, others = self._without_materials(residual[:, None], units * expected, jacobian)
         precision = self._precision[:, None]
-        # What chamber and lamps can explain by themselves does not count.
+        # The part that chamber and lamps can explain is removed.
         hessian = (others * precision).T @ others + CORRELATED * self._prior()[0]
         known = np.linalg.solve(hessian, (others * precision).T @ np.hstack([residual, columns]))
         residual, *columns = (np.hstack([residual, columns]) - others @ known).T
         columns = np.stack(columns, axis=-1)
         significance = self.errors.significance(residual, columns, self._precision)
         best = int(significance.argmax())
-        if significance[best] < CALLED_FOR:
+        if significance[best] < SIGNIFICANT_LAMP:
             return False
         weighted = columns[:, best] * self._precision
         strength = (weighted @ residual) / (weighted @ columns[:, best])
@@ -200,7 +202,7 @@ class _Fit:
         return True
 
     def result(self) -> LightFit:
-        """What the fit says, with the light's uncertainty."""
+        """The result, with the light's uncertainty."""
         self._bounce()
         residual, full = self._linearised()
         residual, jacobian = self._without_materials(residual[:, None], full)
@@ -242,7 +244,7 @@ class _Fit:
         return np.clip((above / np.maximum(below, 1e-9))[self._nearest_seen], 1e-4, 1.0)
 
     def _linearised(self) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m parameters"]]:
-        """Relative residuals, and relative change of what is expected with the light's parameters.
+        """Relative residuals, and relative derivatives of the expected values by the light's parameters.
 
         Both are means over the bands, weighted by the square of the expected reflectance. The parameters are the
         chamber's harmonics, the lamps, their directions along two tangents, and their nearness if there are lamps.
@@ -261,7 +263,7 @@ class _Fit:
         return residual, np.hstack(columns)
 
     def _without_materials(self, *columns: np.ndarray) -> list[np.ndarray]:
-        """Columns without their weighted mean over each element's views, which its material takes up."""
+        """Columns without their weighted mean over each element's views, which its material absorbs."""
         total = np.maximum(self._sum_by_element @ self.weights, 1e-9)[:, None]
         means = ((self._sum_by_element @ (self.weights[:, None] * column)) / total for column in columns)
         return [column - mean[self.views.element] for column, mean in zip(columns, means, strict=True)]
@@ -276,7 +278,7 @@ class _Fit:
         self._precision = self.weights * used / std**2
 
     def _prior(self) -> tuple[np.ndarray, np.ndarray]:
-        """Precision of what is expected of the parameters, and its pull from where they are."""
+        """Precision of the parameters' prior, and its gradient at their present values."""
         light, lamps = self.light, len(self.light.lamps)
         precision = np.zeros(TERMS + 3 * lamps + (lamps > 0))
         precision[:TERMS] = np.where(harmonic_degrees(DEGREE) > 0, self.unevenness**-2.0, 0.0)
@@ -288,7 +290,7 @@ class _Fit:
         now[:TERMS], now[TERMS : TERMS + lamps] = light.chamber, light.lamps
         if lamps:
             now[-1] = light.nearness
-        of_chamber, of_lamps = units_on(self.white, light.to_lamps)
+        of_chamber, of_lamps = unit_irradiance(self.white, light.to_lamps)
         white = np.zeros(len(precision))
         white[:TERMS], white[TERMS : TERMS + lamps] = of_chamber, of_lamps
         missing = 1.0 - of_chamber @ light.chamber - of_lamps @ light.lamps
@@ -307,24 +309,24 @@ class _Fit:
                 light,
                 chamber=light.chamber + step[:TERMS],
                 lamps=np.maximum(light.lamps + step[TERMS : TERMS + lamps], 0.1 * light.lamps),
-                to_lamps=to_lamps / np.maximum(np.linalg.norm(to_lamps, axis=1, keepdims=True), 1e-9),
+                to_lamps=unit_vectors(to_lamps),
                 nearness=float(np.clip(light.nearness + step[-1], 0.0, 1.0 / LEAST_DISTANCE_M)) if lamps else 0.0,
             )
         )
 
-    def _set(self, light: StandingLight) -> None:
+    def _set(self, light: StationaryLight) -> None:
         if not np.array_equal(light.to_lamps, self.light.to_lamps):
             self.lamps = self.elements.lamps_at(self.views, light.to_lamps)
         self.light = light
 
-    def _see_unevenness(self, covariance: np.ndarray) -> None:
-        """Root mean square of the chamber's harmonics as far as they are seen (MacKay 1992)."""
+    def _estimate_unevenness(self, covariance: np.ndarray) -> None:
+        """Root mean square of the chamber's harmonics, weighted by how well the views show them (MacKay 1992)."""
         uneven = harmonic_degrees(DEGREE) > 0
         seen = np.clip(1.0 - np.diag(covariance)[:TERMS] / self.unevenness**2, 0.0, 1.0)[uneven].sum()
         square = (self.light.chamber[uneven] ** 2).sum() + UNEVENNESS_COUNT * UNEVENNESS**2
         self.unevenness = min(float(np.sqrt(square / (seen + UNEVENNESS_COUNT))), MOST_UNEVEN)
 
-    def _see_colours(self) -> None:
+    def _estimate_colours(self) -> None:
         """The colour of the lamps that fits each band best; the white reference stays white."""
         light = self.light
         of_chamber, of_lamps = light.on(self.white)
@@ -338,7 +340,7 @@ class _Fit:
         weighted = self._precision[:, None] / CORRELATED * slope
         gain = (weighted * slope).sum(axis=0) + COLOUR_STD**-2
         step = ((weighted * residual).sum(axis=0) + (1.0 - light.lamp_colour) * COLOUR_STD**-2) / gain
-        # Their strength is what they have in common.
+        # A change that all bands share is one of the lamps' strength.
         colour = np.clip(light.lamp_colour + step - step.mean(), 0.0, 1.0 + of_chamber / of_lamps)
         chamber_colour = 1.0 + (1.0 - colour) * of_lamps / of_chamber
         self.light = replace(light, lamp_colour=colour, chamber_colour=chamber_colour)

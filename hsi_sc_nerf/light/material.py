@@ -1,4 +1,4 @@
-"""From what was measured of an object to its material: the irradiance at any of its points, with its uncertainty."""
+"""The irradiance at any point of an object, with its uncertainty, and the materials of its surface."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.light.elements import NORMAL_WEIGHT, Elements, shown_points
 from hsi_sc_nerf.light.fit import LEAST_IRRADIANCE, OCCLUSION_ERROR, LightFit, fit_light
-from hsi_sc_nerf.light.standing_light import even_directions
+from hsi_sc_nerf.light.stationary_light import even_directions
 from hsi_sc_nerf.light.views import TurningElements, Views, transfer
 
 RAY_DIRECTIONS = 2048
-"""Over the sphere: 4.5 degrees apart."""
+"""Number of rays over the sphere: 4.5 degrees apart."""
 BAND_GROUPS = 8
-"""The light is fitted to so many means of neighbouring bands: its colours are smooth."""
+"""The light is fitted to this number of means of neighbouring bands: its colours are smooth."""
 NEIGHBOURS = 4
-"""Irradiance at a point is a mean over so many elements."""
+"""Number of elements over which the irradiance at a point is averaged."""
 UNEXPLAINED = 2.0
-"""Error of irradiance relative to the scatter: what the model misses in single views it also misses in their mean."""
+"""Error of irradiance relative to the scatter: the model's errors in single views do not average out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class ObjectLight:
     Attributes:
         elements: of the object and its support.
         turning: the elements as they turn under the light.
-        views: what frames measured of them.
+        views: measurements of them in the frames.
         fit: the light by groups of bands.
         spectral: the fit's light and materials at the bands of the views.
     """
@@ -100,8 +100,8 @@ def turning_elements(
     Args:
         elements: of the object and its support.
         rotations: camera-to-object rotation of each frame.
-        pixel_m: what pixels show of an element lies within this radius.
-        lift_m: rays begin so far outside of the surface.
+        pixel_m: radius of the area around an element that a pixel shows.
+        lift_m: distance of the rays' origins from the surface.
     """
     directions = even_directions(RAY_DIRECTIONS)
     points, normals, weights = shown_points(elements, pixel_m, lift_m)
@@ -116,12 +116,12 @@ def turning_elements(
 def light_on_object(
     elements: Elements, turning: TurningElements, views: Views, white_normal: Float[np.ndarray, "3"]
 ) -> ObjectLight:
-    """Fit the light to groups of bands, and take it to all bands.
+    """Fit the light to groups of bands, and interpolate it to all bands.
 
     Args:
         elements: of the object and its support.
         turning: the elements as they turn under the light.
-        views: what frames measured of them.
+        views: measurements of them in the frames.
         white_normal: outward unit normal of the white reference, camera's frame.
     """
     bands = views.reflectance.shape[1]

@@ -1,8 +1,8 @@
-"""The light on the object of a trained run, and whether the object is shaded at all.
+"""The light on the object of a trained run, and whether the light is uneven at all.
 
-The run's surface casts the shade, its training frames are the measurements. Two things tell of uneven light. The
-brightness of elements changes from view to view as the light says. And elements of like spectra are the darker the
-less light reaches them, which also shows light that does not change with the turn.
+The run's surface casts the shade, and its training frames are the measurements. Uneven light shows in two ways. The
+brightness of an element changes from view to view as the fitted light predicts. And of elements with similar spectra,
+those that receive less light are darker; this also shows light that does not change with the turn.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.mesh import Mesh
@@ -22,20 +21,19 @@ from hsi_sc_nerf.light.material import ObjectLight, light_on_object, turning_ele
 from hsi_sc_nerf.light.views import TurningElements, Views
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.packed.cube import unpack
+from hsi_sc_nerf.processing.view_changes import like_spectra
 from hsi_sc_nerf.surface.depth_renders import DepthRenders, render_depth_maps
 from hsi_sc_nerf.surface.outline_opacity import outline_opacity
 from hsi_sc_nerf.surface.surface_points import SurfaceMesh, surface_mesh
 
 ELEMENTS, SUPPORT_ELEMENTS = 2000, 800
-"""On the object and on what it stands on: 2 to 4 mm apart on a fruit."""
+"""Number of elements on the object and on its support: 2 to 4 mm apart on a fruit."""
 LIFT_M = 0.0005
-"""Rays begin so far outside of the surface: half a voxel of the mesh."""
+"""Distance of the rays' origins from the surface: half a voxel of the mesh."""
 SMOOTHING_M = 0.003
 """Normals and light are means over this radius: the mesh is rough by its voxels, and pixels show no more."""
 LEAST_VIEWS = 200
-"""Fewer measurements tell nothing of the light."""
-ALIKE = 12
-"""Each element is compared with so many others of the most similar spectra."""
+"""Fewer measurements do not determine the light."""
 LEAST_UNEVENNESS = 0.01
 """Irradiance that varies by less over the object changes no result."""
 CERTAIN = 3.0
@@ -49,7 +47,7 @@ class RunLight:
     Attributes:
         run: the trained run.
         light: irradiance and materials.
-        evidence: what tells of shading.
+        evidence: of uneven light.
         renders: depth maps of the training frames.
         mesh: the object's surface, scene units.
     """
@@ -130,7 +128,8 @@ def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"]) -> RunLi
 
 
 def seen_part(mesh: SurfaceMesh, renders: DepthRenders) -> SurfaceMesh:
-    """The triangles that some frame sees: fusion also leaves a shell within the object, where its distances end."""
+    """The triangles that some frame sees. Fusion also leaves a shell inside the object, at the truncation
+    distance."""
     middles = mesh.vertices[mesh.triangles].mean(axis=1)
     device = renders.camera_to_world.device
     where, outward = (torch.from_numpy(array).float().to(device) for array in (middles, mesh.facet_normals()))
@@ -141,14 +140,14 @@ def seen_part(mesh: SurfaceMesh, renders: DepthRenders) -> SurfaceMesh:
 
 @dataclass(frozen=True)
 class ShadingEvidence:
-    """What tells of uneven light on an object.
+    """Evidence of uneven light on an object.
 
     Attributes:
-        turning: brightness changes from view to view by this factor of what the fitted light says: 1 if it is right.
+        turning: ratio of measured to predicted changes of brightness from view to view; 1 if the light is right.
         turning_std: standard deviation of it.
         turning_spread: standard deviation of irradiance between the views of an element, relative.
-        profile: brightness changes by this factor of what the light says between elements of like spectra: 1 if the
-            light is right and materials alike, 0 in even light.
+        profile: ratio of measured to predicted differences of brightness between elements of similar spectra; 1 if
+            the light is right and the materials are the same, 0 in even light.
         profile_std: standard deviation of it.
         profile_spread: standard deviation of irradiance between elements, relative.
     """
@@ -191,9 +190,8 @@ def shading_evidence(elements: TurningElements, views: Views, fit: LightFit) -> 
     turning = _slope(brighter, lighter, weights, cells[element])
     seen = np.unique(element)
     spectra = np.stack([np.bincount(element, weights * band, count) for band in views.reflectance[rows].T], axis=-1)
-    shapes = spectra[seen] / np.linalg.norm(spectra[seen], axis=1, keepdims=True)
-    _, alike = cKDTree(shapes).query(shapes, min(ALIKE + 1, len(seen)))
-    # Each against the mean of those like it, itself among them.
+    alike = like_spectra(spectra[seen])
+    # Each is compared with the mean of the similar ones and itself.
     own_brighter, own_lighter = (mean[seen] - mean[seen][alike].mean(axis=1) for mean in means)
     profile = _slope(own_brighter, own_lighter, np.ones(len(seen)), cells[seen])
     return ShadingEvidence(*turning, float(np.std(lighter)), *profile, float(np.std(means[1][seen])))

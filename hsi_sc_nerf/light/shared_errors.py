@@ -1,8 +1,9 @@
-"""What measurements tell if many of them share an error, and some are grossly wrong.
+"""Estimation from measurements that share errors in groups, some of them outliers.
 
-Thousands of measurements with shared errors of mesh, poses and model look far more certain than they are. So the
-spread of their gradients is taken from groups (Liang and Zeger 1986; several ways of grouping as in Cameron, Gelbach
-and Miller 2011), and weighs the measurements in the fit: the generalised method of moments (Hansen 1982).
+Treated as independent, thousands of measurements with shared errors of mesh, poses and model would give far too small
+standard deviations. The covariance of their gradients is therefore estimated from groups (Liang and Zeger 1986; for
+several groupings, Cameron, Gelbach and Miller 2011). It weights the measurements in the fit: the generalised method
+of moments (Hansen 1982).
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from jaxtyping import Float, Int
 from hsi_sc_nerf.robust_scatter import robust_std
 
 CORRELATED = 8.0
-"""At best so many measurements count as one."""
+"""Smallest number of measurements that count as one."""
 TUKEY = 4.685
 """Cut-off of Tukey's weights in standard deviations: 95 % efficient for normal errors."""
 SMALLEST_SCATTER = 0.002
@@ -37,17 +38,17 @@ class SharedErrors:
         jacobian: Float[np.ndarray, "m parameters"],
         precision: Float[np.ndarray, "m"],
     ) -> tuple[Float[np.ndarray, "parameters parameters"], Float[np.ndarray, "parameters"]]:
-        """Inverse covariance of parameters, and its product with the step that fits the measurements best.
+        """Inverse covariance of the parameters, and its product with the step that fits the measurements best.
 
         Args:
-            residual: measured less expected.
-            jacobian: change of what is expected.
-            precision: of each measurement if it stood alone.
+            residual: measured minus expected values.
+            jacobian: derivatives of the expected values.
+            precision: inverse variance of each measurement without shared errors.
         """
         weighted = jacobian * precision[:, None]
         alone, sums = weighted.T @ jacobian, self._by_group @ (weighted * residual[:, None])
         spread = CORRELATED * alone + sums.T @ sums
-        # For parameters that nothing shows yet.
+        # For parameters that no measurement depends on yet.
         spread += 1e-9 * np.trace(spread) * np.eye(len(spread))
         known = np.linalg.solve(spread, np.column_stack([alone, sums.sum(axis=0) / self._groupings]))
         return alone @ known[:, :-1], alone @ known[:, -1]
@@ -68,7 +69,7 @@ class SharedErrors:
 
 
 def scatter_beyond(residual: Float[np.ndarray, "m"], own_std: Float[np.ndarray, "m"]) -> float:
-    """The standard deviation that residuals have in common beyond their own ones; by their median, against gloss."""
+    """Common standard deviation of residuals beyond their own ones; from their median, which is robust to gloss."""
     low, high = SMALLEST_SCATTER, 1.0
     for _ in range(20):
         middle = np.sqrt(low * high)
@@ -80,5 +81,5 @@ def scatter_beyond(residual: Float[np.ndarray, "m"], own_std: Float[np.ndarray, 
 
 
 def tukey_weights(scaled: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
-    """Tukey's biweight; never quite 0, so that no element is left without a measurement."""
+    """Tukey's biweight, but never 0, so that no element is left without a measurement."""
     return np.maximum(np.where(np.abs(scaled) < TUKEY, (1.0 - (scaled / TUKEY) ** 2) ** 2, 0.0), 1e-6)

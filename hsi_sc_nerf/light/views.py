@@ -1,4 +1,4 @@
-"""What elements see of each other and of open directions, what frames measure of them, and the irradiance there."""
+"""Visibility between elements and of open directions, measurements of the elements, and their irradiance."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import scipy.sparse
 from jaxtyping import Bool, Float, Int
 
 from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene
-from hsi_sc_nerf.light.standing_light import DEGREE, LOBE_WIDTH_RAD, StandingLight, harmonics, lobes, tangents
+from hsi_sc_nerf.light.stationary_light import DEGREE, LOBE_WIDTH_RAD, StationaryLight, harmonics, lobes, tangents
 
 RAYS_AT_ONCE = 1 << 21
 BOUNCES = 4
 """Diffuse reflections between elements that are followed."""
 LEAST_COSINE = 0.15
-"""Lamps that graze a surface hardly light it, however near."""
+"""Lamps at grazing angles hardly light a surface, however near they are."""
 CELLS_ACROSS = 4
 """Cells across the object; elements in one of them share errors of mesh and poses."""
 FACING_SIDE = 0.35
@@ -66,7 +66,7 @@ def transfer(
         element_of_triangle: element that each of their triangles belongs to.
         elements: their number.
         directions: unit vectors, evenly spread over the sphere.
-        lift_m: rays begin so far outside of the surface, so that its roughness does not occlude them.
+        lift_m: distance of the rays' origins from the surface, so that its roughness does not occlude them.
     """
     scene = ray_scene(occluders.vertices, occluders.triangles)
     along = directions.astype(np.float32)
@@ -97,9 +97,9 @@ class Views:
         element: index of the element.
         frame: index of the frame.
         reflectance: as measured, relative to the white reference.
-        shows_light: whether the light is fitted to it; others serve their element's material alone. Markers do not,
-            whose pixels hold paper and ink.
-        own_std: standard deviation relative to the reflectance, as far as it is known beforehand.
+        shows_light: whether the light is fitted to it; the others determine their element's material only. It is
+            false on markers, whose pixels cover paper and ink.
+        own_std: the known part of the standard deviation, relative to the reflectance.
     """
 
     element: Int[np.ndarray, "m"]
@@ -126,7 +126,7 @@ class LampUnits:
 
 @dataclass(frozen=True, eq=False)
 class TurningElements:
-    """Elements that turn under a light that stands still in the camera's frame.
+    """Elements that turn under light that is stationary in the camera's frame.
 
     Attributes:
         positions: relative to the point at which the white reference was captured; metres, object frame.
@@ -144,7 +144,7 @@ class TurningElements:
     directions: Float[np.ndarray, "directions 3"]
     rotations: Float[np.ndarray, "frames 3 3"]
 
-    def direct(self, light: StandingLight, frame: int) -> Float[np.ndarray, "n bands"]:
+    def direct(self, light: StationaryLight, frame: int) -> Float[np.ndarray, "n bands"]:
         """Irradiance of all elements in a frame by chamber and lamps alone."""
         weights, to_lamps = self.transfer.open_weights, light.to_lamps @ self.rotations[frame].T
         chamber = weights @ (self._harmonics[frame] @ light.chamber).astype(np.float32)
@@ -153,7 +153,7 @@ class TurningElements:
         return chamber[:, None] * light.chamber_colour + (lamps @ light.lamps)[:, None] * light.lamp_colour
 
     def bounced(
-        self, light: StandingLight, material: Float[np.ndarray, "n bands"], frame: int
+        self, light: StationaryLight, material: Float[np.ndarray, "n bands"], frame: int
     ) -> Float[np.ndarray, "n bands"]:
         """Irradiance of all elements in a frame by each other, after up to `BOUNCES` diffuse reflections."""
         direct = self.direct(light, frame).astype(np.float32)

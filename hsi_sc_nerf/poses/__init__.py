@@ -1,1 +1,1 @@
-"""Camera poses from a camera that stands still before a turntable."""
+"""Camera poses of a stationary camera in front of a turntable."""

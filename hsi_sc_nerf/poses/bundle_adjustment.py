@@ -31,8 +31,8 @@ from hsi_sc_nerf.poses.turntable import Turntable
 _MOST_STEPS = 100
 _FIRST_DAMPING, _DAMPING_FACTOR = 1e-4, 8.0
 _DAMPING_RANGE = (1e-12, 1e8)
-# A known focal length weighs as if its standard deviation were this fraction of what it is, for that of the landmarks
-# may be wrong by more than they tell (``Adjusted.covariance`` counts what it is).
+# A known focal length is weighted as if its standard deviation were this fraction of the stated one, because that of
+# the landmarks may be wrong by more than its covariance (``Adjusted.covariance`` uses the stated one).
 _PRIOR_SCALE = 0.03
 
 
@@ -110,15 +110,14 @@ class Problem:
         self.numbers = sum(part.numbers for part in residuals)
 
     def cost(self, turntable: Turntable) -> float:
-        """Sum of the losses of the residuals, and of the squares of what contradicts prior knowledge."""
+        """Sum of the losses of the residuals and of the squared differences from prior knowledge."""
         residual, _ = self.priors(turntable)
         return sum(float(part.losses(turntable).sum()) for part in self.residuals) + float(residual @ residual)
 
     def priors(self, turntable: Turntable) -> tuple[Float[np.ndarray, "k"], Float[np.ndarray, "k p+1"]]:
-        """Distances from what is known before in standard deviations, and their derivatives.
+        """Differences from prior knowledge in standard deviations, and their derivatives.
 
-        The angle of no frame is known better than another's, that of the first one neither: known angles count
-        relative to the mean of all.
+        Known angles are compared relative to their mean, because no frame's angle is known better than another's.
         """
         free, c = self.free, self.layout
         residual, by = [np.zeros(0)], [np.zeros((0, c.motion_size + 1))]
@@ -231,7 +230,7 @@ class Problem:
 
 
 class NormalEquations:
-    """Gauss-Newton equations of all parameters. No landmark meets another: their part is block-diagonal."""
+    """Gauss-Newton equations of all parameters. Landmarks are not coupled: their part is block-diagonal."""
 
     def __init__(self, jacobian: csr_array, residual: Float[np.ndarray, "N"], problem: Problem) -> None:
         """Args:
@@ -263,8 +262,8 @@ class NormalEquations:
         return self.motion + self.coupling.T @ self.landmark_responses()
 
     def reduced(self, kind: int) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "l p"]]:
-        """One kind's part of ``information``, and what each of its landmarks, being unknown, adds to the gradient
-        by camera and motion. The contributions add to zero where the turntable is adjusted."""
+        """One kind's part of ``information``, and the contribution of each of its landmarks to the gradient by camera
+        and motion after the landmark is eliminated. The contributions sum to 0 for an adjusted turntable."""
         columns, part = self.problem.layout.landmarks[kind] - self.p, self.problem.residuals[kind]
         first = sum(other.numbers for other in self.problem.residuals[:kind])
         motion, residual = (a[first : first + part.numbers] for a in (self.jacobian[:, : self.p], self.residual))
@@ -277,7 +276,7 @@ class NormalEquations:
         )
 
     def landmark_responses(self) -> Float[np.ndarray, "m-p p"]:
-        """Derivatives of the landmarks that fit best by camera and motion."""
+        """Derivatives of the best-fitting landmarks by camera and motion."""
         return -self._by_landmarks(self.coupling)
 
     def _by_landmarks(self, right: Float[np.ndarray, "m-p k"], damping: float = 0.0) -> Float[np.ndarray, "m-p k"]:
@@ -299,8 +298,7 @@ class Adjusted:
     """Frames that were left out because they fit the turntable only with a motion of their own, and the root mean
     square distance of their corners from the turntable's at the best angle, px."""
     evidence: Mapping[str, float] = field(default_factory=dict)
-    """How strongly the observations call for lens_distortion and for wobble: -log10 of the probability that chance
-    alone lowers the squares as much."""
+    """Evidence for lens_distortion and for wobble: -log10 of the p-value of an F-test."""
 
     @cached_property
     def cost(self) -> float:
@@ -314,16 +312,16 @@ class Adjusted:
 
     @property
     def variance(self) -> float:
-        """Variance of the residuals, at least 1, which it is if the observations' covariances are right."""
+        """Variance of the residuals, at least 1, its value if the observations' covariances are right."""
         return max(1.0, self.cost / self.degrees_of_freedom)
 
     def covariance(self) -> Float[np.ndarray, "p p"]:
         """Covariance of camera, lens, angles and motions, in the order of ``ParameterLayout``.
 
-        Errors of one point in neighbouring frames are alike. Its observations count together, by how much the points
-        contradict each other (the cluster-robust estimate of K.-Y. Liang and S. L. Zeger, 1986; A. C. Cameron and
-        D. L. Miller, "A practitioner's guide to cluster-robust inference", 2015). Hidden errors, of unit variance,
-        were not adjusted: they add what they do to the parameters.
+        Errors of one point in neighbouring frames are correlated, so the observations of a point form a cluster, and
+        the covariance comes from the scatter between clusters (the cluster-robust estimate of K.-Y. Liang and
+        S. L. Zeger, 1986; A. C. Cameron and D. L. Miller, "A practitioner's guide to cluster-robust inference",
+        2015). Hidden errors, of unit variance, are not adjusted; their effect on the parameters is added.
         """
         equations = self.problem.normal_equations(self.turntable)
         information, hidden = equations.information(), np.concatenate(self.problem.layout.hidden)

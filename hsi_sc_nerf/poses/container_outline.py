@@ -30,8 +30,8 @@ _HEIGHTS = np.linspace(0.15, 0.7, 24)
 _AZIMUTHS = np.deg2rad(np.linspace(-60.0, 60.0, 24))
 # From one tried radius or height to the next, and standard deviation of the Gaussian over them.
 _STEP_PX, _SMOOTHING_PX = 0.2, 0.7
-# An edge changes the brightness by this from one pixel to the next, gray levels, but for so many points in a hundred;
-# frames agree to this fraction of the radius.
+# Least slope of the brightness at an edge, gray levels per pixel, and the percentage of its points that may have
+# less; and largest spread of the frames' results, as a fraction of the radius.
 _LEAST_SLOPE, _WEAKEST_PERCENTILE = 2.0, 20.0
 _LARGEST_SPREAD = 0.02
 _ROUNDS = 3
@@ -58,7 +58,7 @@ def container_outline(
 ) -> ContainerOutline | None:
     """Radius and foot of the upright container about the axis.
 
-    A container off the axis moves both edges to one side; the mean of both tells its radius.
+    If the container is off the axis, both edges move to one side, so the radius is the mean of both.
 
     Returns:
         None where two edges and a foot do not stand out in most frames, or do not agree.
@@ -103,7 +103,7 @@ def container_outline(
     depth = float(looks @ [-turntable.distance, 0.0, foot])
     edge = _EDGE_PX * depth / turntable.focal_px
     errors = np.hypot(scatter / np.sqrt(len(found)), [edge, edge / abs(turntable.camera_rotation[1, 2])])
-    # What stands higher is nearer to a camera that looks down, and seems wider.
+    # A higher container is nearer to a camera that looks down, and appears wider.
     nearer = looks[2] / depth * errors[1]
     return ContainerOutline(radius, float(np.hypot(errors[0] / radius, nearer)), foot, float(errors[1]))
 
@@ -144,10 +144,10 @@ def _arcs(radius: float, feet: Float[np.ndarray, "z"]) -> Float[np.ndarray, "1 a
 def _slopes(
     image: Float[np.ndarray, "h w"], turntable: Turntable, points: Float[np.ndarray, "k points n 3"]
 ) -> Float[np.ndarray, "k n"]:
-    """How much the brightness changes from pixel to pixel across each of n lines, at least at most of its points.
+    """Slope of the brightness across each of n lines, which most of its points reach; 0 outside of the image.
 
-    An edge of the container goes all along its height, before the disc and before the wall; patterns of the wall do
-    not. 0 outside of the image.
+    An edge of the container extends over its whole height, in front of the disc and of the wall. Patterns on the wall
+    do not.
     """
     in_camera = (points - [turntable.distance, 0.0, 0.0]) @ turntable.camera_rotation.T
     pixels = turntable.focal_px * in_camera[..., :2] / in_camera[..., 2:] + turntable.centre_px

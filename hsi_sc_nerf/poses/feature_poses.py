@@ -42,10 +42,10 @@ _FOCAL_SIGMA = 0.002
 _LEAST_ANGLE_SIGMA_RAD = 1e-3
 """Least standard deviation of a turntable's known angles."""
 _SIGMAS, _LEAST_TILT_DEG, _LEAST_ZOOM = 3.0, 0.3, 0.02
-"""An earlier camera is contradicted beyond so many standard deviations, and this tilt of the axis or this fraction of
-the focal length."""
+"""The features contradict an earlier camera from this many standard deviations, and this tilt of the axis or this
+fraction of the focal length."""
 MOST_CONTRADICTING = 1 / 3
-"""Largest fraction of COLMAP's poses that may contradict one turntable: of more it is not known which are right."""
+"""Largest fraction of COLMAP's poses that may contradict one turntable: with more, the right ones are not known."""
 
 Images = Sequence[UInt8[np.ndarray, "h w"]]
 """One image per frame, or ``SessionPictures``."""
@@ -60,7 +60,7 @@ class KnownCamera:
     camera_to_world: Float[np.ndarray, "4 4"]
     """Pose at the angle 0, object frame, metres."""
     direction: Literal["ccw", "cw"] | None = None
-    """The turntable's turn seen from above; None where the earlier session does not tell."""
+    """The turntable's turn seen from above; None if the earlier session does not show it."""
 
     @property
     def distance_m(self) -> float:
@@ -96,10 +96,22 @@ def known_angles_deg(info: SessionInfo, frames: int) -> Float[np.ndarray, "n"] |
     return None if info.nominal_step_deg is None else sign * info.nominal_step_deg * np.arange(frames)
 
 
+def required_angles_deg(info: SessionInfo, frames: int) -> Float[np.ndarray, "n"]:
+    """`known_angles_deg`, which must be known.
+
+    Raises:
+        InputError: they are not known, or not one angle per frame is given.
+    """
+    angles_deg = known_angles_deg(info, frames)
+    if angles_deg is None:
+        raise InputError("the angles are not known; give nominal_step_deg or frame_angles_deg in session.json")
+    return angles_deg
+
+
 def poses_from_known_camera(
     names: Sequence[str], size_px: tuple[int, int], info: SessionInfo, camera: KnownCamera
 ) -> TurntablePoses:
-    """Poses of a camera that has not moved since an earlier session, from angles alone: nothing is measured.
+    """Poses of a camera that has not moved since an earlier session, from known angles alone, without measurement.
 
     Args:
         size_px: width and height of the images.
@@ -107,18 +119,16 @@ def poses_from_known_camera(
         camera: of the earlier session; its direction counts where ``info`` has none.
 
     Raises:
-        InputError: images of another size than the camera's, unknown angles, or an unknown direction, with which the
-            poses would be mirrored as likely as not.
+        InputError: images of another size than the camera's, unknown angles, or an unknown direction: the poses might
+            be mirrored.
     """
     camera.check_size(size_px)
     direction, n = info.direction or camera.direction, len(names)
-    angles_deg = known_angles_deg(info, n)
-    if angles_deg is None:
-        raise InputError("the angles are not known; give nominal_step_deg or frame_angles_deg in session.json")
+    angles_deg = required_angles_deg(info, n)
     if direction is None:
         raise InputError(
-            "which way the turntable turns is not known, nor do the angles of the earlier session tell; give "
-            "direction (ccw or cw) in session.json"
+            "which way the turntable turns is not known, neither from session.json nor from the angles of the "
+            "earlier session; give direction (ccw or cw) in session.json"
         )
     if info.direction is None and direction == "cw":
         angles_deg = -angles_deg
@@ -163,9 +173,7 @@ def poses_from_features(
     height, width = images[0].shape
     if camera is not None:
         camera.check_size((width, height))
-    angles_deg = known_angles_deg(info, len(names))
-    if hold_angles and angles_deg is None:
-        raise InputError("the angles are not known; give nominal_step_deg or frame_angles_deg in session.json")
+    angles_deg = (required_angles_deg if hold_angles else known_angles_deg)(info, len(names))
     grays = SessionPictures.of(images).named(GRAY)
     if free is None:
         free = structure_from_motion(grays, names, focal_px=None if camera is None else camera.intrinsics.fl_x)
@@ -198,8 +206,8 @@ def prior_of_angles(turntable: Turntable, known_rad: Float[np.ndarray, "n"]) -> 
     """
     known, found = known_rad[turntable.frames], turntable.angles_rad
     known = np.copysign(1.0, np.dot(np.diff(known), np.diff(found))) * known
-    away = found - found.mean() - known + known.mean()
-    return known - known[0] + found[0], max(float(np.sqrt((away**2).mean())), _LEAST_ANGLE_SIGMA_RAD)
+    deviation_rad = found - found.mean() - known + known.mean()
+    return known - known[0] + found[0], max(float(np.sqrt((deviation_rad**2).mean())), _LEAST_ANGLE_SIGMA_RAD)
 
 
 def _posed(
@@ -271,6 +279,6 @@ def check_camera(adjusted: Adjusted, found: AdjustedTracks, camera: KnownCamera)
         return []
     sentence = (
         f"The camera is not as in the earlier session: its focal length differs by {100.0 * focal:+.1f} % and the "
-        f"axis leans by {tilt_deg:.1f} degrees; do without --camera, or take a session of the unmoved camera."
+        f"axis leans by {tilt_deg:.1f} degrees; leave out --camera, or give a session of the camera as it stands now."
     )
     return [Finding("poses-camera", "red", sentence, {"focal_percent": 100.0 * focal, "tilt_deg": tilt_deg})]

@@ -17,7 +17,7 @@ from hsi_sc_nerf.poses.session_pictures import GRAY, SessionPictures
 Detections: TypeAlias = dict[int, Float[np.ndarray, "4 2"]]
 """Marker id to its corners in pixels (corner origin), clockwise from the upper left one of the marker's pattern."""
 
-# Markers are looked for at several magnifications, up to this length of the longer side: the adaptive threshold
+# Markers are searched for at several magnifications, up to this length of the longer side: the adaptive threshold
 # has fixed windows, and no single magnification finds both upright and foreshortened markers.
 _LARGEST_SIDE_PX = 1024
 _MAGNIFICATIONS = (1, 2, 4, 8)
@@ -36,7 +36,7 @@ _FAMILIES: dict[str, tuple[str, ...]] = {
     "DICT_APRILTAG_16h5": ("DICT_APRILTAG_16h5",),
 }
 _FRAMES_FOR_DICTIONARY = 8
-# With so many of its markers in a frame, no other family needs to be tried.
+# With this many of its markers in a frame, no other family needs to be tried.
 _CLEAR_MARKERS_PER_FRAME = 2
 
 
@@ -64,8 +64,8 @@ def marker_pattern(dictionary: str, marker: int) -> UInt8[np.ndarray, "cells cel
 def detect_markers(image: UInt8[np.ndarray, "h w"], dictionary: str) -> Detections:
     """Markers seen at any of several magnifications of the image.
 
-    Their corners are good to about half a pixel, and some markers are misread: ``fit_marker`` refines the ones and
-    rejects the others.
+    Their corners are good to about half a pixel, which ``fit_marker`` refines. Some markers are misread, which it
+    rejects.
     """
     detector = _detector(dictionary)
     found: Detections = {}
@@ -87,7 +87,7 @@ def detect_markers(image: UInt8[np.ndarray, "h w"], dictionary: str) -> Detectio
 def find_dictionary(images: Sequence[UInt8[np.ndarray, "h w"]]) -> str | None:
     """The dictionary whose markers are seen most often in a few of the frames; None if there are none.
 
-    Of a family the smallest dictionary that holds the ids is taken: it tolerates the most misread cells. Where the
+    The smallest dictionary of a family that holds the ids is taken: it tolerates the most misread cells. If the
     frames' best pictures show no marker, the broad mean is searched too: sharp edges need not be those of ink.
     """
     session = SessionPictures.of(images)

@@ -19,8 +19,8 @@ from hsi_sc_nerf.robust_scatter import robust_std
 
 # Of the paper around the marker this much is taken into the fit, in cells.
 _MARGIN_CELLS = 0.7
-# A blur brings in what lies around the paper: the margin is narrower by so many standard deviations of it, down to a
-# least one.
+# Blur mixes in the surroundings of the paper: the margin is narrower by this many standard deviations of the blur,
+# down to a least one.
 _BLUR_MARGIN = 1.5
 _LEAST_MARGIN_CELLS = 0.2
 # The pattern's edges are ramps one texel wide: half a pixel, where a cell has more than a few pixels.
@@ -28,14 +28,14 @@ _TEXELS_PER_PX = 2.0
 _TEXELS_PER_CELL = (8, 16, 32)
 _ITERATIONS = 12
 _CONVERGED_PX = 3e-3
-# A fit explains the pixels when what it leaves is below this fraction of their variance.
+# A fit explains the pixels if its residuals have less than this fraction of their variance.
 _LARGEST_UNEXPLAINED = 0.15
-# A start that leaves more than this cannot converge: something else is in front of the marker.
+# A start with larger residuals cannot converge: something else is in front of the marker.
 _HOPELESS_UNEXPLAINED = 0.8
 # Errors of the pattern's model itself (print, lens, shading) that the pixels' residual does not show.
 _MODEL_ERROR_PX = 0.02
 _HUBER_SIGMAS = 2.5
-# A pixel's footprint is cut off at so many standard deviations of the blur.
+# A pixel's footprint is cut off at this many standard deviations of the blur.
 _BLUR_REACH = 3.0
 
 

@@ -33,7 +33,7 @@ _LEAST_OUT_OF_FOCUS = 0.01
 # With fewer markers in its best picture, a frame's other pictures are searched too. Where more are seen, the adjusted
 # turntable predicts the rest.
 _FEW_MARKERS = 4
-# A marker that the adjustment expects is looked for if it is seen at least this steeply (cosine to its normal).
+# An expected marker is searched for if its front faces the camera at least this much (cosine to its normal).
 _STEEPEST_COSINE = 0.1
 _FARTHEST_FROM_EXPECTED_PX = 1.0
 
@@ -53,7 +53,7 @@ def observe(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str) -> Obse
     frames = session.frames
     with ThreadPoolExecutor(_WORKERS) as pool:
         detections = list(pool.map(lambda frame: _detect(frame, dictionary), frames))
-        # What lenses blur, they blur by wavelength: each name has a blur of its own.
+        # A lens's blur depends on the wavelength: each picture has a blur of its own.
         names = sorted({name for found in detections for name in found})
         of_name = {name: [found.get(name, {}) for found in detections] for name in names}
         typical = {name: find_blur(session.named(name), dictionary, seen) for name, seen in of_name.items()}
@@ -105,7 +105,7 @@ def _out_of_focus(fitted: Sequence[Sequence[tuple[int, FittedMarker | None]]]) -
 def find_blur(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str, detections: Sequence[Detections]) -> float:
     """Standard deviation of the blur, in pixels, with which the largest markers' patterns fit their pixels best.
 
-    Of the markers the median counts: a few may be hidden, or in frames that are blurred otherwise.
+    The median over the markers is minimised: a few may be hidden, or in frames with another blur.
     """
     seen = [(i, m, c) for i, found in enumerate(detections) for m, c in sorted(found.items())]
     seen.sort(key=lambda s: -quad_area(s[2]))

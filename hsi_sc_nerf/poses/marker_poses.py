@@ -32,12 +32,12 @@ def poses_from_markers(
     names: Sequence[str],
     info: SessionInfo,
 ) -> TurntablePoses:
-    """Poses from markers that turn with the object before a camera that stands still.
+    """Poses from markers that turn with the object in front of a stationary camera.
 
     Estimated are the focal length, the camera's pose, the axis, one angle per frame and the markers' layout; radial
-    lens distortion and small motions of a wobbling table where the images call for them (``select_model``). A few
-    displaced frames are left out. Pixels are square. The principal point is the image's centre: one axis hardly
-    determines it (docs/concepts/poses.md).
+    lens distortion and small motions of a wobbling table if the images show them (``select_model``). A few displaced
+    frames are left out. Pixels are square. The principal point is the image's centre: one axis hardly determines it
+    (docs/concepts/poses.md).
 
     Args:
         images: one grey image per frame, all of one size, linear in reflectance (a gamma moves every edge).
@@ -130,5 +130,5 @@ def _dropped(names: Sequence[str], used: np.ndarray, rejected: Sequence[Rejected
     dropped = {}
     for f in np.flatnonzero(~used).tolist():
         why = reasons.get(f)
-        dropped[names[f]] = f"its markers do not count: {why.most_common(1)[0][0]}" if why else "no marker was found"
+        dropped[names[f]] = f"its markers were rejected: {why.most_common(1)[0][0]}" if why else "no marker was found"
     return dropped

@@ -108,7 +108,7 @@ def _draw_ruler(axes: Axes) -> None:
     ticks = np.arange(0.0, RULER_MM + 1.0, 10.0)
     axes.hlines(_MARGIN_MM + 8.0, _MARGIN_MM, _MARGIN_MM + RULER_MM, color="black", linewidth=0.8)
     axes.vlines(_MARGIN_MM + ticks, _MARGIN_MM + 8.0, _MARGIN_MM + 11.0, color="black", linewidth=0.8)
-    told = (
+    text = (
         f"Measure this line: {RULER_MM:g} mm. If it is longer or shorter, print again at 100 %, not fitted to page."
     )
-    axes.text(_MARGIN_MM, _MARGIN_MM + 6.0, told, va="top", size=8)
+    axes.text(_MARGIN_MM, _MARGIN_MM + 6.0, text, va="top", size=8)

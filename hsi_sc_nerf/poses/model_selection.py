@@ -1,11 +1,10 @@
-"""The marker observations that poses rest on, and the simplest turntable model that explains them.
+"""Selection of the marker observations that poses are computed from, and of the simplest model that explains them.
 
-Observations that do not count are named with the reason. The lens is without or with distortion, the table without or
-with wobble.
+Rejected observations are returned with the reason. The lens has no distortion or some, the table no wobble or some.
 
-A model with more parameters is selected where an F-test on the weighted sums of squares rejects the simpler one. The
-variance is that of the richer model's residuals, and at least that of the corners' fit. Where only a few frames call
-for motions of their own, the object, the table or the camera was displaced in them, and they are left out.
+A model with more parameters is selected if an F-test on the weighted sums of squares rejects the simpler one. The
+variance is that of the richer model's residuals, and at least that of the corners' fit. If only a few frames need
+motions of their own, the object, the table or the camera was displaced in them, and they are left out.
 """
 
 from __future__ import annotations
@@ -41,12 +40,12 @@ _LARGEST_ANGLE_SIGMA_DEG = 0.5
 LOSS_SIGMAS = 3.0
 """Whitened residuals beyond this many standard deviations count by their size, not its square."""
 EVIDENCE_NEEDED = 6.0
-"""Least -log10 of the probability under the simpler model; strict, for errors of neighbouring corners are not quite
-independent."""
+"""Least -log10 of the p-value of the simpler model. It is strict, because errors of neighbouring corners are not
+quite independent."""
 # A wobbling table's tilts (rad) and shifts (of the camera's distance) before their spread is known.
 _FIRST_SPREAD = (0.02, 0.01)
 _LEAST_SPREAD = (1e-5, 1e-6)
-# At most this fraction of the frames, but at least one, is displaced; if more call for a motion, the table wobbles.
+# At most this fraction of the frames, but at least one, is displaced; if more need a motion, the table wobbles.
 _MOST_DISPLACED = 0.1
 _SMALLEST_P = 1e-99
 # Numbers that describe a frame's own motion: angle, tilts (2), shifts (3).
@@ -153,7 +152,7 @@ def without_uncertain_frames(
 
 
 def _select_model(start: Turntable, observations: MarkerObservations) -> tuple[Adjusted, MarkerObservations]:
-    """The selected model, and the observations that it rests on."""
+    """The selected model, and the observations that it was adjusted to."""
     best = select_model(start.restricted(observations), observations)
     return best, observations.without_frames(list(best.displaced_frames))
 
@@ -196,8 +195,8 @@ _Solve = Callable[[Turntable, FreeParameters], Adjusted]
 def select_model(start: Turntable, observations: MarkerObservations) -> Adjusted:
     """The simplest model that explains the corners, adjusted.
 
-    The lens is decided first, on a table that does not wobble. If then the table should move, a few displaced frames
-    are tried as the explanation. If it wobbles, the lens is decided again beside it.
+    The lens is selected first, with a table that does not wobble. If the corners then need motions of the table, a
+    few displaced frames are tried as the explanation. If the table wobbles, the lens is selected again with it.
     """
     solve = partial(_solve, observations)
     steady, wobbling = _steady(start, solve)
@@ -225,8 +224,8 @@ def frame_motions(
         turntable: without wobble; observations of markers that it lacks are ignored.
 
     Returns:
-        Of each frame the probability that chance alone lowers its squares as much as a motion of its own does
-        (F-test), and the root mean square distance of its corners from the turntable's at its best angle, px.
+        The p-value of each frame without a motion of its own (F-test), and the root mean square distance of its
+        corners from the turntable's at its best angle, px.
     """
     seen = observations.select(turntable.knows(observations))
     n, frame = len(turntable.frames), np.searchsorted(turntable.frames, seen.frame)
@@ -270,7 +269,7 @@ def _solve(observations: MarkerObservations, turntable: Turntable, free: FreePar
 
 
 def _steady(start: Turntable, solve: _Solve) -> tuple[Adjusted, Adjusted | None]:
-    """The model without wobble; and the one with it, if the corners call for it."""
+    """The model without wobble; and the one with it, if the evidence suffices."""
     steady = solve(replace(start, radial=(0.0, 0.0), motion=None), FreeParameters())
     steady = _with_lens(steady, solve)
     sigmas = (_FIRST_SPREAD[0], _FIRST_SPREAD[1] * steady.turntable.distance)
@@ -290,7 +289,7 @@ def _without_displaced_frames(start: Turntable, observations: MarkerObservations
             return None, None
         return _steady(start.restricted(rest), partial(_solve, rest))
 
-    # Displaced frames bend a turntable that is fitted to them: judge by one without the likeliest.
+    # Displaced frames distort a turntable that is fitted to them, so the test uses one without the likeliest.
     p_value, _ = frame_motions(start, observations)
     likeliest = start.frames[np.sort(np.argsort(p_value, kind="stable")[:most])]
     steady, wobbling = steady_without(likeliest)
@@ -320,7 +319,7 @@ def _motion_spread(turntable: Turntable) -> tuple[float, float]:
 
 
 def _with_lens(plain: Adjusted, solve: _Solve) -> Adjusted:
-    """The model with as many terms of radial distortion as the corners call for, one after the other."""
+    """The model with terms of radial distortion, which are added one by one while the evidence suffices."""
     evidence = {**plain.evidence, "lens_distortion": 0.0}
     for terms in (1, 2):
         distorted = solve(plain.turntable, replace(plain.problem.free, radial_terms=terms))
@@ -338,4 +337,15 @@ def _evidence(more: Adjusted, less: Adjusted) -> float:
     if more.problem.numbers <= more.problem.layout.size:
         return 0.0
     ratio = (less.cost - more.cost) / extra / more.variance
-    return float(-np.log10(max(f_distribution.sf(ratio, extra, more.degrees_of_freedom), _SMALLEST_P)))
+    return f_test_evidence(ratio, extra, more.degrees_of_freedom)
+
+
+def f_test_evidence(ratio: float, extra: int, degrees_of_freedom: int) -> float:
+    """-log10 of the probability of at least this ratio of variances by chance (F-test).
+
+    Args:
+        ratio: sum of squares that ``extra`` parameters explain, over their number and the residuals' variance.
+        extra: number of these parameters.
+        degrees_of_freedom: of the residuals' variance.
+    """
+    return float(-np.log10(max(f_distribution.sf(ratio, extra, degrees_of_freedom), _SMALLEST_P)))

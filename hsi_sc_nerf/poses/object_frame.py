@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
-from hsi_sc_nerf.geometry.camera import rotation_about_z
+from hsi_sc_nerf.geometry.camera import rotation_about_z, unit_vectors
 from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters, Problem
 from hsi_sc_nerf.poses.container_outline import ContainerOutline
 from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS
@@ -103,7 +103,7 @@ def container_diameter(turntable: Turntable, container_height: float | None) -> 
     upright = (np.abs(normals[:, 2]) < _UPRIGHT_SINE) & ((normals[:, :2] * centres[:, :2]).sum(-1) > 0)
     if container_height is not None:
         upright &= centres[:, 2] - disc_height(turntable) < container_height
-    normals = normals[upright, :2] / np.linalg.norm(normals[upright, :2], axis=-1, keepdims=True)
+    normals = unit_vectors(normals[upright, :2])
     distance = (normals * centres[upright, :2]).sum(-1)
     if len(distance) == 0:
         return None

@@ -1,7 +1,7 @@
 """Are the pixels square? A line scanner whose speed does not fit its frame rate makes them longer or shorter.
 
-The images of square markers that turn tell the pixels' shape: with their lines moved closer or further apart, one
-spacing explains the corners best.
+Images of square markers in many orientations determine the pixels' shape: the images' lines are moved closer together
+or further apart until the turntable fits the corners best.
 """
 
 from __future__ import annotations
@@ -9,30 +9,28 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import f as f_distribution
 
 from hsi_sc_nerf.findings import Finding, Level
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, Problem
-from hsi_sc_nerf.poses.model_selection import EVIDENCE_NEEDED, LOSS_SIGMAS
+from hsi_sc_nerf.poses.model_selection import EVIDENCE_NEEDED, LOSS_SIGMAS, f_test_evidence
 from hsi_sc_nerf.poses.residuals import MarkerResiduals
 from hsi_sc_nerf.poses.turntable import MarkerObservations
 
 ASPECT_AMBER, ASPECT_RED = 0.005, 0.015
 """Departures from square pixels. One of 0.03 moves poses by a centimetre (docs/validation/sessions.md)."""
 _STEP, _ROUNDS = 0.02, 3
-"""Steps of the logarithm in which the best spacing is looked for."""
-_SMALLEST_P = 1e-99
+"""Steps of the search for the best spacing (logarithm), and number of its rounds."""
 
 
 def pixel_aspect(adjusted: Adjusted, observations: MarkerObservations) -> tuple[float, float]:
-    """Height of a pixel over its width by the markers, and how strongly they call for it.
+    """Height of a pixel over its width by the markers, and the evidence that pixels are not square.
 
     Args:
         adjusted: the turntable of square pixels.
         observations: the corners that it was adjusted to.
 
     Returns:
-        The ratio, and -log10 of the probability that chance alone lowers the squares as much.
+        The ratio, and -log10 of the p-value for square pixels.
 
     Example:
         >>> adjusted, kept, _ = adjust_without_outliers(start, observations)
@@ -59,12 +57,11 @@ def pixel_aspect(adjusted: Adjusted, observations: MarkerObservations) -> tuple[
         best += float(np.clip(move, -4.0 * _STEP, 4.0 * _STEP))
         found = solved(best)
     gain = max(cost_of_squares - found.cost, 0.0) / found.variance
-    p_value = max(float(f_distribution.sf(gain, 1, found.degrees_of_freedom)), _SMALLEST_P)
-    return float(np.exp(best)), float(-np.log10(p_value))
+    return float(np.exp(best)), f_test_evidence(gain, 1, found.degrees_of_freedom)
 
 
 def stretched(observations: MarkerObservations, factor: float, centre_px: float) -> MarkerObservations:
-    """The corners with the images' lines further apart by a factor, from the line of the principal point on."""
+    """The corners with the images' lines further apart by a factor; the line of the principal point is fixed."""
     scale, centre = np.array([1.0, factor]), np.array([0.0, centre_px])
     both = np.tile(scale, 4)
     return replace(
@@ -76,12 +73,12 @@ def stretched(observations: MarkerObservations, factor: float, centre_px: float)
 
 def check_pixel_aspect(aspect: float, evidence: float) -> list[Finding]:
     """The finding ``poses-aspect`` where pixels are not square (`pixel_aspect`)."""
-    away = abs(aspect - 1.0)
-    if evidence <= EVIDENCE_NEEDED or away <= ASPECT_AMBER:
+    departure = abs(aspect - 1.0)
+    if evidence <= EVIDENCE_NEEDED or departure <= ASPECT_AMBER:
         return []
-    level: Level = "red" if away > ASPECT_RED else "amber"
+    level: Level = "red" if departure > ASPECT_RED else "amber"
     sentence = (
-        f"The pixels are {100.0 * away:.1f} % {'higher' if aspect > 1.0 else 'lower'} than wide by the markers: "
+        f"The pixels are {100.0 * departure:.1f} % {'higher' if aspect > 1.0 else 'lower'} than wide by the markers: "
         "match the scanner's speed to its frame rate, or resample the cubes to square pixels."
     )
     return [Finding("poses-aspect", level, sentence, {"height_over_width": aspect, "evidence": evidence})]

@@ -18,8 +18,8 @@ from hsi_sc_nerf.poses.result import TurntablePoses
 PoseMethod: TypeAlias = Literal["auto", "markers", "colmap", "angles"]
 
 FIELD_OF_VIEW_DEG = (4.0, 100.0)
-"""Fields of view over the image's width, from a long tele lens to a very wide one: features that give another camera
-are too few."""
+"""Plausible fields of view over the image's width, from a long tele lens to a very wide one. Too few features may
+give another one."""
 # In the order in which they are tried.
 _NAMES: dict[str, str] = {"markers": "markers", "colmap": "features (COLMAP)", "angles": "known angles"}
 
@@ -34,7 +34,7 @@ def find_poses(
     from_markers: Callable[..., TurntablePoses] = poses_from_markers,
     from_features: Callable[..., TurntablePoses] = poses_from_features,
 ) -> TurntablePoses:
-    """Poses by one method, or by the first that works; the result tells which was taken and why.
+    """Poses by one method, or by the first that works; the result names the method and why it was used.
 
     Args:
         images: one gray image per frame, all of one size, or ``SessionPictures``.

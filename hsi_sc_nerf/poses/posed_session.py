@@ -28,12 +28,12 @@ from hsi_sc_nerf.poses.result import Scale, ScaleSource, TurntablePoses, Uncerta
 from hsi_sc_nerf.poses.turntable import MarkerObservations, Turntable, project, projection_jacobian
 
 _FIELD_PX = 0.007
-"""Standard deviation of each field's amplitude for corners: print, lens and pixels are that far from the model's."""
+"""Standard deviation of each field's amplitude for corners: print, lens and pixels differ from the model by this."""
 _FEATURE_FIELD_PX = 0.03
-"""Standard deviation of each field's amplitude for features: they creep over a skin as its light and its slope change
+"""Standard deviation of each field's amplitude for features: they drift over a skin as its light and slope change
 (docs/validation/poses.md)."""
 _DRAWS = 2000
-"""Errors that are drawn by the covariance, for the largest of all frames has no closed form."""
+"""Random errors drawn from the covariance: the largest error over all frames has no closed form."""
 
 
 def in_object_frame(
@@ -127,7 +127,7 @@ def pose_uncertainty(
     camera[:, : len(layout.camera)] = drawn[:, layout.camera]
     turns = camera[:, None, 1:4] + angles[..., None] * turntable.camera_rotation[:, 2]
     # The camera over the disc: its distance from the axis, its height, and its arc along the circle from the first
-    # frame's. And the size of what turns.
+    # frame's. And the size of the object.
     height, size = _landmark_gradients(adjusted)
     radius, radius_variance = np.zeros_like(size), 0.0
     if outline is not None:
@@ -138,7 +138,7 @@ def pose_uncertainty(
     variance = (metres**2) * position.max(axis=1).mean()
     distance = float(sigmas[4]) ** 2 if 4 in layout.camera else 0.0
     if outline is not None:
-        # The container's size is exact: what the camera leaves open in its radius is open in the camera's distance.
+        # The container's size is exact, so an error of its radius in the images is one of the camera's distance.
         distance += float(radius @ covariance @ radius) + radius_variance
         reach_sq = turntable.distance**2 + outline.foot**2
         variance += metres**2 * (outline.foot_sigma**2 + distance * reach_sq)
@@ -186,8 +186,8 @@ def _landmark_gradients(adjusted: Adjusted) -> tuple[Float[np.ndarray, "p"], Flo
 def with_hidden_errors(adjusted: Adjusted) -> Adjusted:
     """The same turntable with a covariance that counts smooth displacements over the image (``smooth_fields``).
 
-    Residuals hardly show them, for another camera explains most of them. Of features they show some, which then tell
-    how large the others are.
+    Residuals hardly show such displacements, because another camera explains most of them. The residuals of features
+    show some of them, which gives the size of the others.
     """
     turntable, problem = adjusted.turntable, adjusted.problem
     parts = [
@@ -209,8 +209,8 @@ def with_hidden_errors(adjusted: Adjusted) -> Adjusted:
 def _shown_variance(problem: Problem, turntable: Turntable, kind: int) -> float:
     """Variance of the amplitudes of one kind's hidden errors, by the method of moments.
 
-    At the solution the derivatives of the cost by the amplitudes are V a + noise: V is what the parameters leave of
-    their information, and the noise is the scatter from point to point.
+    At the solution the derivatives of the cost by the amplitudes are V a + noise: V is the amplitudes' information
+    after the parameters are eliminated, and the noise is the scatter from point to point.
     """
     equations, hidden = problem.normal_equations(turntable), problem.layout.hidden[kind]
     information, (_, scores) = equations.information(), equations.reduced(kind)

@@ -17,13 +17,13 @@ from hsi_sc_nerf.poses.result import TurntablePoses, is_full_turn
 
 # The paper's target for the reprojection error (section "Pose Estimation").
 REPROJECTION_TARGET_PX = 1.0
-# Contradictions count beyond so many standard deviations.
+# Contradictions count from this many standard deviations.
 _SIGMAS = 3.0
 # A plaque that carries a marker stands off the container's wall: the container is found wider by up to this.
 _LARGEST_PLAQUE_PERCENT = 2.5
 # A distance measured by tape, from a lens whose centre is inside, is good to this.
 _DISTANCE_PERCENT = 5.0
-# A marker's side is odd if it differs by this and by so many standard deviations.
+# A marker's side is odd if it differs by this and by this many standard deviations.
 _ODD_SIDE, _ODD_SIDE_SIGMAS = 0.01, 4.0
 # A turntable's step differs from its nominal one by up to this fraction; a single angle by up to this one.
 _STEP_TOLERANCE, _ANGLE_TOLERANCE = 0.05, 0.25
@@ -41,7 +41,7 @@ _TITLE_CHARACTERS = 190
 
 
 def check_poses(poses: TurntablePoses, info: SessionInfo) -> list[Finding]:
-    """What speaks for and against the poses.
+    """Check the poses against each other and against what is known of the session.
 
     Args:
         poses: of the session.
@@ -75,8 +75,8 @@ def step_deviation_deg(poses: TurntablePoses, info: SessionInfo) -> float | None
     index = np.flatnonzero(poses.used)
     angles = poses.angles_deg[poses.used]
     step = np.copysign(info.nominal_step_deg, np.median(np.diff(angles)))
-    away = angles - step * (index - index[0])
-    return float(np.abs((away + 180.0) % 360.0 - 180.0).max())
+    deviation_deg = angles - step * (index - index[0])
+    return float(np.abs((deviation_deg + 180.0) % 360.0 - 180.0).max())
 
 
 def _check_uncertainty(poses: TurntablePoses) -> list[Finding]:
@@ -105,12 +105,13 @@ def _check_angles(poses: TurntablePoses, info: SessionInfo) -> list[Finding]:
         found.append(Finding("poses-direction", "red", sentence, {"given": info.direction, "found": direction}))
     if info.frame_angles_deg is not None and len(info.frame_angles_deg) == len(poses.used):
         given = np.copysign(1.0, median) * np.abs(np.array(info.frame_angles_deg) - info.frame_angles_deg[0])
-        away = (poses.angles_deg - given)[poses.used]
-        away = np.abs((away - np.median(away) + 180.0) % 360.0 - 180.0)
-        if away.max() > _ANGLE_DEG:
-            level: Level = "red" if np.median(away) > _ANGLE_DEG else "amber"
-            sentence = f"Angles depart from frame_angles_deg by {np.median(away):.1f} to {away.max():.1f} degrees."
-            found.append(Finding("poses-angles", level, sentence, {"largest_deviation_deg": float(away.max())}))
+        difference_deg = (poses.angles_deg - given)[poses.used]
+        difference_deg = np.abs((difference_deg - np.median(difference_deg) + 180.0) % 360.0 - 180.0)
+        typical, largest = float(np.median(difference_deg)), float(difference_deg.max())
+        if largest > _ANGLE_DEG:
+            level: Level = "red" if typical > _ANGLE_DEG else "amber"
+            sentence = f"Angles depart from frame_angles_deg by {typical:.1f} to {largest:.1f} degrees."
+            found.append(Finding("poses-angles", level, sentence, {"largest_deviation_deg": largest}))
         return found
     nominal, deviation = info.nominal_step_deg, step_deviation_deg(poses, info)
     if nominal is None or deviation is None:
@@ -148,7 +149,7 @@ def _check_scale(poses: TurntablePoses) -> list[Finding]:
         if abs(side - 1.0) > max(_ODD_SIDE, _ODD_SIDE_SIGMAS * scale.marker_side_sigmas[marker]):
             sentence = (
                 f"Marker {marker} seems {100.0 * abs(side - 1.0):.1f} % {'larger' if side > 1.0 else 'smaller'} than "
-                "the others; all must have one side."
+                "the others; all must have the same side."
             )
             found.append(Finding("poses-markers", "amber", sentence, {"marker": marker, "relative_side": side}))
     return found
@@ -181,7 +182,7 @@ def _left_out(poses: TurntablePoses) -> str:
 
 
 def pose_report(poses: TurntablePoses, info: SessionInfo, findings: Sequence[Finding] = ()) -> dict:
-    """Figures of an estimate and what was found in it; numbers that are unknown are None."""
+    """Figures and findings of an estimate; unknown numbers are None."""
     steps = np.diff(poses.angles_deg[poses.used])
     full_turn = is_full_turn(poses.angles_deg[poses.used])
     # The mean axis in the camera's axes: right, up, backwards.

@@ -49,8 +49,8 @@ class Residuals(ABC):
         """Projections less observations, in standard deviations."""
         projection = turntable.project(self.seen)
         behind = projection.in_camera[:, 2:] <= self.nearest * turntable.distance
-        away = np.where(behind, np.inf, projection.pixels - self.pixels)
-        return self.scaled(away[..., None]).reshape(len(self.seen), *self.shape)
+        difference = np.where(behind, np.inf, projection.pixels - self.pixels)
+        return self.scaled(difference[..., None]).reshape(len(self.seen), *self.shape)
 
     def jacobian(self, turntable: Turntable) -> tuple[Jacobian, Float[np.ndarray, "n g*r d"]]:
         """Derivatives by camera and motion, and by the parameters of the row's own landmark."""

@@ -64,7 +64,7 @@ class Scale:
 class Uncertainty:
     """Standard deviations by the covariance of the adjustment; the length that gives the scale is taken for exact.
 
-    ``process`` goes by the worst frame, and the largest of many errors exceeds the standard deviation of each.
+    ``process`` checks the worst frame, and the largest of many errors exceeds the standard deviation of each.
     """
 
     focal: float
@@ -83,7 +83,7 @@ class Uncertainty:
 
 @dataclass(frozen=True)
 class TurntablePoses:
-    """Poses of all frames in the object frame (docs/concepts/frames.md), and what they rest on.
+    """Poses of all frames in the object frame (docs/concepts/frames.md), and the evidence for them.
 
     Rows of frames that are not ``used`` are nan: a frame that cannot be posed is left out, never guessed.
     ``dropped`` says why, by the frame's name. Angles are degrees, counter-clockwise seen from above, relative to the
@@ -94,7 +94,7 @@ class TurntablePoses:
     names: tuple[str, ...]
     intrinsics: PinholeIntrinsics
     distortion: tuple[float, float, float, float]
-    """OpenCV's k1, k2, p1, p2; k1 and k2 are exactly 0 where the images do not call for them."""
+    """OpenCV's k1, k2, p1, p2; k1 and k2 are exactly 0 unless the images show a distortion."""
     camera_to_world: Float[np.ndarray, "n 4 4"]
     angles_deg: Float[np.ndarray, "n"]
     reprojection_error_px: Float[np.ndarray, "n"]
@@ -116,7 +116,7 @@ class TurntablePoses:
     method: Literal["markers", "colmap", "angles"] = "markers"
     """How the poses were found."""
     chosen: str = ""
-    """Which method was taken, and why not another."""
+    """Which method was used, and why the others were not."""
     metric: bool = True
     """Whether lengths are metres; otherwise they are in units of the camera's distance from the axis."""
     model: Literal["turntable", "free poses"] = "turntable"
@@ -124,8 +124,7 @@ class TurntablePoses:
     wobble_deg: float | None = None
     """Root mean square of the table's tilts off its mean axis, where the poses are free."""
     evidence: Mapping[str, float] = field(default_factory=dict)
-    """How strongly the images call for lens_distortion and for wobble, where the method decides it: -log10 of the
-    probability that chance alone fits as well."""
+    """Evidence for lens_distortion and for wobble, where the method tests for them: -log10 of the p-value."""
     outliers: tuple[RejectedMarker, ...] = ()
     scale: Scale | None = None
     """Where the size comes from; None where it is not known."""

@@ -31,13 +31,13 @@ BAND_GROUPS_NM: Mapping[str, tuple[float, float]] = {
     "red edge": (680.0, 750.0),
     "near infrared": (750.0, 900.0),
 }
-"""The other groups in which markers are looked for, nm."""
+"""The other groups of bands that are searched for markers, nm."""
 
-# The broad mean stays unless another picture is better by this factor: many bands quiet what the score does not see.
+# The broad mean is kept unless another picture is better by this factor: many bands reduce errors outside the score.
 _CLEARLY_BETTER = 1.25
 # A pixel with more than this fraction of its group's values flagged is not well exposed.
 _MOST_FLAGGED = 0.1
-# A group is scored by so many of its bands, evenly spread: they do to rank pictures, at a fraction of the cost.
+# Number of bands by which a group is scored, evenly spread: enough to rank pictures, at a fraction of the cost.
 _BANDS_TO_SCORE = 8
 # Reflectance at which a pixel is as good as black, and as good as clipped.
 _BLACK, _WHITE = 0.004, 0.996
@@ -45,7 +45,7 @@ _BLACK, _WHITE = 0.004, 0.996
 _EDGE_FRACTION = 0.02
 # No pixel of a picture of 8 bits is known better than this.
 _ROUNDING = 1.0 / (255.0 * np.sqrt(12.0))
-# J. Immerkær, "Fast noise variance estimation" (1996): it sees neither steps nor slopes, and lifts noise by 6.
+# J. Immerkær, "Fast noise variance estimation" (1996): it removes steps and slopes, and multiplies noise by 6.
 _NOISE_MASK = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
 _NOISE_GAIN, _MEDIAN_OF_NORMAL = 6.0, 0.6745
 # Lines of a cube that are worked on at a time, and frames that are read at the same time.
@@ -59,7 +59,7 @@ class FramePictures:
 
     Attributes:
         picture: the picture of a name.
-        scores: by the names of those in which markers are looked for, best first (``edge_precision``).
+        scores: of those that are searched for markers, by name, best first (``edge_precision``).
     """
 
     picture: Callable[[str], UInt8[np.ndarray, "h w"]]
@@ -67,7 +67,7 @@ class FramePictures:
 
     @property
     def ranking(self) -> tuple[str, ...]:
-        """Names of the pictures in which markers are looked for, best first."""
+        """Names of the pictures that are searched for markers, best first."""
         return tuple(self.scores)
 
 
@@ -131,7 +131,7 @@ def frame_pictures(
         name: (wavelengths_nm >= low) & (wavelengths_nm <= high)
         for name, (low, high) in {GRAY: gray_nm, **BAND_GROUPS_NM}.items()
     }
-    # The instrument may have no band there; of its broad mean the same is taken as when it was made: all bands.
+    # If the instrument has no band there, the broad mean was made of all bands.
     members[GRAY] = members[GRAY] if members[GRAY].any() else np.ones(len(wavelengths_nm), bool)
     members = {name: inside for name, inside in members.items() if inside.any()}
     few = {name: _evenly_spread(inside) for name, inside in members.items()}
@@ -227,7 +227,7 @@ def edge_precision(
     Args:
         reflectance: the picture.
         measured: which pixels are well measured; all if not given.
-        bands: the picture that is judged has so many times the bands of ``reflectance``; noise falls with their root.
+        bands: ratio of the judged picture's number of bands to that of ``reflectance``; noise falls with its root.
 
     Returns:
         0 where no pixel is exposed well.

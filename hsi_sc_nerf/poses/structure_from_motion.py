@@ -27,19 +27,19 @@ if TYPE_CHECKING:
 # glog's level "fatal": errors are reported by the results.
 _QUIET = 3
 _STRETCH_PERCENTILES = (0.5, 99.5)
-# Frames up to this part of a full turn apart are matched, and at least so many neighbours to each side.
+# Frames up to this fraction of a full turn apart are matched, and at least this many neighbours on each side.
 _NEIGHBOURS_TURN = 0.2
 _FEWEST_NEIGHBOURS = 3
-# Focal length in image widths during mapping, where it is not known. One orbit of a small object hardly tells it from
-# the distance; the bundle adjustment of the turntable finds it.
+# Focal length in image widths during mapping, if it is not known. One orbit around a small object hardly separates it
+# from the distance; the bundle adjustment of the turntable determines it.
 _FOCAL_FACTOR = 1.5
 _SEED = 0
 # Least contrast of a SIFT feature: less than COLMAP's 0.0067, for skin is smooth.
 _PEAK_THRESHOLD = 0.004
 # Standard deviation of the Gaussian that lowers the images' noise, pixels.
 _SMOOTHING_PX = 1.0
-# A pixel moves if its brightness varies over the frames by more than so many times the noise, and by more than this
-# standard deviation, gray levels: rounding to 8 bits alone makes less.
+# A pixel moves if its brightness varies over the frames by more than this multiple of the noise, and by more than
+# this standard deviation, gray levels: rounding to 8 bits alone causes less.
 _NOISE_FACTOR = 3.0
 _LEAST_CHANGE = 1.0
 # Gaps up to this fraction of the image's shorter side are closed: even skin between its patterns.
@@ -50,7 +50,7 @@ _MARGIN_FRACTION = 0.002
 _LEAST_AREA_FRACTION = 0.0005
 # Brightness classes of equal size in which the noise is measured: photon noise grows with the light.
 _BRIGHTNESS_CLASSES = 16
-# At least this fraction of a class stands still; otherwise a brighter class gives its noise.
+# At least this fraction of a class is static; otherwise a brighter class gives its noise.
 _STILL_FRACTION = 0.1
 
 
@@ -95,7 +95,7 @@ def structure_from_motion(
             f"nothing moves in the {len(images)} frames {names[0]} ... {names[-1]}; check that the turntable turned "
             "between the frames, and that the object has some texture"
         )
-    # The images are stretched to the contrast of what moves.
+    # The images are stretched to the contrast of the moving pixels.
     low, high = np.percentile(np.stack(images)[:, moving], _STRETCH_PERCENTILES)
     table = np.rint(np.clip((np.arange(256) - low) / max(high - low, 1.0), 0.0, 1.0) * 255.0).astype(np.uint8)
     with tempfile.TemporaryDirectory(prefix="hsi-sc-nerf-colmap-") as name:
@@ -117,8 +117,8 @@ def structure_from_motion(
 def moving_pixels(images: Sequence[UInt8[np.ndarray, "h w"]]) -> Bool[np.ndarray, "h w"]:
     """Pixels that show something that turns in some of the frames.
 
-    Structure from motion must not see the static background: it would find a camera that stands still. Only what
-    changes the image is found: an even disc and the outline of a body of revolution do not. The lamps' drift, one
+    Structure from motion must not see the static background, or it would find a stationary camera. Only pixels whose
+    brightness changes are found, so not an even disc nor the outline of a body of revolution. The lamps' drift, one
     factor per frame, is removed first.
 
     Args:
@@ -248,7 +248,7 @@ def _lamp_factor(image: Float[np.ndarray, "h w"], middle: Float[np.ndarray, "h w
 def _noise_spread(mean: Float[np.ndarray, "h w"], spread: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """Standard deviation over the frames due to noise alone, at each pixel by its brightness.
 
-    Noise does not fall with brightness, so a class in which too little stands still takes that of a brighter one.
+    Noise does not decrease with brightness, so a class with too few static pixels takes that of a brighter one.
     """
     edges = np.quantile(mean, np.linspace(0.0, 1.0, _BRIGHTNESS_CLASSES + 1)[1:-1])
     brightness_class = np.searchsorted(edges, mean)

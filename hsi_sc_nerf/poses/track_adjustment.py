@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, closest_point_to_rays
+from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, closest_point_to_rays, unit_vectors
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters, Problem
 from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS
 from hsi_sc_nerf.poses.posed_session import with_hidden_errors
@@ -23,20 +23,20 @@ from hsi_sc_nerf.poses.turntable_from_poses import reversed_in_depth
 # Residuals well above this count by their length, not its square, pixels. Small, because features that are no point
 # of the object, such as an outline or the shadow side of a bump, creep over it slowly.
 _LOSS_PX = 0.1
-# Far from the solution a small loss scale holds on to what fits by chance.
+# Far from the solution, a small loss scale would keep what fits by chance.
 _FIRST_LOSS_PX = 1.0
 _SMALLEST_GAIN = 1e-6
 # Outliers are farther than this many standard deviations, measured on the residuals, and than this, pixels.
 _OUTLIER_SIGMAS = 4.0
 _LEAST_OUTLIER_PX = 0.3
 _OUTLIER_ROUNDS = 4
-# Of a turntable and its reversal in depth one is wrong if it fits so many times worse before outliers are rejected.
+# Of a turntable and its reversal in depth, one is wrong if it fits worse by this factor before outliers are rejected.
 _CLEARLY_WORSE = 2.0
 # The median length of a two-dimensional normal residual, in standard deviations of one coordinate.
 _RAYLEIGH_MEDIAN = 1.1774
 _LEAST_MARKER_OUTLIER_PX = 0.5
-# Beside markers features weigh as if their residuals were so many times larger: what displaces them all smoothly over
-# the image does not average out.
+# Together with markers, features are weighted as if their residuals were larger by this factor, because displacements
+# that vary smoothly over the image do not average out.
 _BESIDE_MARKERS = 10.0
 _LEAST_SIGMA_PX = 0.03
 # A marker whose rays are nearly parallel is not placed.
@@ -140,7 +140,7 @@ def _adjusted(turntable: Turntable, kept: Tracks, loss_px: float, free_angles: b
 def adjust_together(
     found: AdjustedTracks, markers: MarkerObservations | None, free: FreeParameters
 ) -> tuple[Adjusted, MarkerObservations | None]:
-    """Adjust tracks, the markers that are seen, and prior knowledge together, with a covariance that can be believed.
+    """Adjust tracks, the visible markers, and prior knowledge together, with a realistic covariance.
 
     Args:
         found: the turntable adjusted to the tracks alone.
@@ -195,7 +195,7 @@ def with_markers(turntable: Turntable, seen: MarkerObservations) -> Turntable:
     markers, marker, views = np.unique(seen.marker, return_inverse=True, return_counts=True)
     poses = turntable.camera_to_world()[np.searchsorted(turntable.frames, seen.frame)] @ OPENCV_TO_OPENGL
     in_camera = np.insert((seen.corners_px - turntable.centre_px) / turntable.focal_px, 2, 1.0, axis=-1)
-    directions = in_camera / np.linalg.norm(in_camera, axis=-1, keepdims=True) @ np.swapaxes(poses[:, :3, :3], 1, 2)
+    directions = unit_vectors(in_camera) @ np.swapaxes(poses[:, :3, :3], 1, 2)
     corners, eigenvalue = closest_point_to_rays(poses[:, None, :3, 3], directions, 4 * marker[:, None] + np.arange(4))
     placed = eigenvalue.reshape(-1, 4).min(axis=1) > _LEAST_EIGENVALUE * views
     faces = corners.reshape(-1, 4, 3)[placed]

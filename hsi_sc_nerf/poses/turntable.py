@@ -29,7 +29,7 @@ the object from within two degrees."""
 
 
 def require_parallax(distance: float, object_distances: Float[np.ndarray, "n"]) -> None:
-    """Refuse an axis through the camera, about which a camera turns that does not move.
+    """Refuse an axis through the camera, which is found if the camera turned in its place.
 
     Args:
         distance: of the camera from the axis.
@@ -40,8 +40,8 @@ def require_parallax(distance: float, object_distances: Float[np.ndarray, "n"]) 
     """
     if distance < _LEAST_DISTANCE * np.median(object_distances):
         raise InputError(
-            "the axis goes through the camera, so that all frames show the object from one side: the camera seems to "
-            "have turned where it stands; let it stand still, and turn the table"
+            "the axis goes through the camera, so all frames show the object from one side: the camera seems to have "
+            "turned in its place; keep it still, and turn the table"
         )
 
 
@@ -200,8 +200,8 @@ class Turntable:
 
     def errors_px(self, seen: MarkerObservations | Tracks) -> Float[np.ndarray, "n"]:
         """Distance of each observation from its projection; of a marker the root mean square over its corners."""
-        away = self.reproject(seen) - self._landmarks(seen)[3]
-        return np.sqrt((away**2).sum(axis=-1).reshape(len(seen), -1).mean(axis=-1))
+        difference = self.reproject(seen) - self._landmarks(seen)[3]
+        return np.sqrt((difference**2).sum(axis=-1).reshape(len(seen), -1).mean(axis=-1))
 
     def frame_errors_px(self, seen: MarkerObservations | Tracks, size: int) -> tuple[Float[np.ndarray, "n"], float]:
         """Root mean square error in each of the session's ``size`` frames, nan without observations; and in all."""

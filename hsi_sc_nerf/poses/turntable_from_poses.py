@@ -4,8 +4,8 @@ With B the camera's rotation in the first frame and u the axis, frame i has
 
     R_i = B Rot(u, a_i)     and     R_i p + t_i = q   for a point p on the axis,
 
-for the axis stands still before the camera. Both are linear in the unknowns (u, then p and q). The object lies about
-the axis, so q is known well even where a frame's rotation and position are wrong together.
+because the axis is stationary in front of the camera. Both are linear in the unknowns (u, then p and q). The object
+is near the axis, so q is known well even if a frame's rotation and position have correlated errors.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import closest_point_to_rays, cross_matrix, rotation_about_z, rotation_angle_deg
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, Turntable, require_parallax
 
-# A frame contradicts the turntable if a misfit is above this and above so many times the median misfit.
+# A frame contradicts the turntable if a misfit is above this and above this multiple of the median misfit.
 _CONTRADICTS_DEG = 3.0
 _CONTRADICTS_DISTANCES = 0.02
 _CONTRADICTS_MEDIANS = 6.0
-# With steps below this the poses are all one: a camera that stands still, with no axis.
+# With smaller steps, all poses are the same: the camera is stationary and there is no axis.
 _LEAST_TURN_DEG = 2.0
 _ROUNDS = 10
 
@@ -71,8 +71,8 @@ def turntable_from_poses(
         good = good & ~wrong
     if good.sum() < FEWEST_FRAMES or np.ptp(np.unwrap(angles[good])) < np.deg2rad(_LEAST_TURN_DEG):
         raise InputError(
-            "the poses that were found do not turn about one axis: the camera seems to stand still or to move freely "
-            "(mask out what does not turn, or take markers)"
+            "the poses that were found do not turn about one axis: the camera seems to be stationary or to move "
+            "freely; mask out what does not turn, or take markers"
         )
 
     if (base @ axis)[1] > 0.0:  # the image's y points down
@@ -104,8 +104,8 @@ def turntable_from_poses(
 def reversed_in_depth(turntable: Turntable) -> Turntable:
     """The turntable whose points, axis and turn are mirrored in depth: a camera far away sees the same of it.
 
-    A long lens hardly tells a turn one way, seen from above, from a turn the other way, seen from below. Structure
-    from motion with a wrong focal length may find the wrong one of the two.
+    With a long lens, a turn in one direction seen from above looks nearly like a turn in the other direction seen
+    from below. Structure from motion with a wrong focal length may find the wrong one of the two.
 
     Args:
         turntable: without markers and motions.
@@ -117,7 +117,7 @@ def reversed_in_depth(turntable: Turntable) -> Turntable:
     rotation = (np.eye(3) - 2.0 * np.outer(sight, sight)) @ turntable.camera_rotation @ mirror
     camera = -rotation.T @ in_camera
     turn = rotation_about_z(float(np.rad2deg(np.arctan2(camera[1], camera[0]))))[:3, :3]
-    away = replace(
+    mirrored = replace(
         turntable,
         camera_rotation=rotation @ turn,
         distance=float(np.hypot(camera[0], camera[1])),
@@ -125,7 +125,7 @@ def reversed_in_depth(turntable: Turntable) -> Turntable:
         # The origin is at the camera's height.
         points_3d=(turntable.points_3d - middle) @ mirror @ turn - [0.0, 0.0, camera[2]],
     )
-    return away.resized(turntable.distance / away.distance)
+    return mirrored.resized(turntable.distance / mirrored.distance)
 
 
 def _agreeing(rotations):
@@ -141,8 +141,8 @@ def _agreeing(rotations):
         return np.zeros(len(rotations), bool)
     axes = relative[turned] / size[turned, None]
     in_camera = np.einsum("pij,pj->pi", rotations[i[turned]], axes)
-    away = np.linalg.norm(np.einsum("nij,pj->pni", rotations, axes) - in_camera[:, None], axis=-1)
-    best = away[np.argmin(np.median(away, axis=1))]
+    misfit = np.linalg.norm(np.einsum("nij,pj->pni", rotations, axes) - in_camera[:, None], axis=-1)
+    best = misfit[np.argmin(np.median(misfit, axis=1))]
     return best <= max(np.deg2rad(_CONTRADICTS_DEG), _CONTRADICTS_MEDIANS * float(np.median(best)))
 
 

@@ -1,8 +1,13 @@
-"""Does the object look the same in all frames? Shade that falls on one, and an object that slipped on the disc.
+"""Does the object look the same in all frames, and does its spectrum have the right order of bands? As findings.
 
-Masks and markers do not tell either: a shadow leaves the outline, and what turns about its own axis may have one
-outline from all sides. The points of the masks' hull do, as the frames see them (`PointViews`), once the light that
-stands still with the camera is taken away: what changes with the direction that a point faces.
+Masks and markers show neither a shadow on one frame nor an object that slipped on the disc: a shadow does not change
+the outline, and a body of revolution has one outline from all sides. The brightness of the points on the masks' hull
+shows both (`PointViews`), after the part that depends on the direction a point faces is removed: that part is light
+that is stationary in the camera's frame.
+
+A header that lists the wavelengths in reverse mirrors every spectrum. The counts do not show it, because lamp and
+detector are weak at both ends. The object does: biological tissue absorbs blue light and scatters near-infrared
+light, and so do most pigments, also blue ones.
 """
 
 from __future__ import annotations
@@ -14,35 +19,42 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from scipy.stats import median_abs_deviation
 
-from hsi_sc_nerf.findings import Finding, leave_out, names_in_short
+from hsi_sc_nerf.findings import Finding, Level, leave_out, names_in_short
 from hsi_sc_nerf.poses.turntable import rotations_about_z
 from hsi_sc_nerf.processing.view_changes import PointViews, facing_cell, mean_by_index
 
 LEVEL_AMBER, LEVEL_RED = 0.04, 0.15
-"""Departures of a frame's brightness (logarithm) from the other frames'. Frames of good sessions stay below 0.01."""
+"""Deviation of a frame's brightness (logarithm) from the other frames. It is below 0.01 in good sessions."""
 PATCH_AMBER, PATCH_RED, PATCH_TIMES = 0.06, 0.2, 3.0
-"""The same of its parts (root mean square over directions), which also have to exceed the typical frame's by a
-factor: noise and a rough hull leave up to 0.03."""
+"""The same for parts of a frame (root mean square over directions). It must also exceed that of a typical frame by a
+factor: noise and a rough hull cause up to 0.03."""
 LEAST_IN_PATCH = 15
 """Fewest points of a part."""
 FEW = 0.1
-"""Fraction of the frames up to which those that are lit otherwise can be left out."""
+"""Up to this fraction of the frames, those with different light are to be left out."""
 FEWEST_FRAMES, FEWEST_POINTS = 6, 200
-"""Fewest frames that tell of one, and fewest points that two frames share."""
+"""Fewest frames with which one can be compared, and fewest points that two frames must share."""
 SLIPS_DEG = np.arange(-30.0, 30.1, 1.5)
 """Turns of the object on the disc that are tried."""
 LEAST_SLIP_DEG, SLIP_FIT = 3.0, 0.65
-"""Two frames fit each other better with a slip if that leaves less than this fraction of their difference. Good
-sessions have 0.75 or more: of a plain object, another part may look alike by chance."""
+"""Least angle of a slip, and the fraction of two frames' difference that may remain with it. Good sessions have 0.75
+or more: another part of a plain object may look the same by chance."""
 MOST_SLIPS, ONE_DIRECTION = 0.5, 0.8
-"""Where more of the pairs slip, nearly all in one direction, reflections stand still on a smooth object."""
+"""If more of the pairs seem to slip, nearly all in one direction, the object is smooth and reflections are
+stationary."""
 MATCHED_M = 0.003
 """Largest distance of points that are compared."""
 LARGEST_SIGMAS = 3.0
-"""Differences count up to this many standard deviations: highlights move otherwise."""
+"""Differences are limited to this many standard deviations: highlights do not move with the object."""
 LEAST_SCATTER = 0.003
 """Scatter of a channel (logarithm) that is stated at least."""
 _ROUNDS = 12
+BLUE_NM, INFRARED_NM = (430.0, 500.0), (850.0, 970.0)
+"""Within 400 to 1000 nm, the range of silicon, each is about the mirror image of the other."""
+ORDER_AMBER, ORDER_RED = 1.3, 2.0
+"""Reflectance in the blue over that in the infrared; 1 for white and grey things, less for tissue."""
+LEAST_BLUE = 0.1
+"""In darker objects, noise and stray light may exceed the reflectance."""
 
 
 def check_appearance(views: PointViews, names: Sequence[str]) -> list[Finding]:
@@ -57,15 +69,15 @@ def check_appearance(views: PointViews, names: Sequence[str]) -> list[Finding]:
     """
     if len(np.unique(views.frame)) < FEWEST_FRAMES:
         return []
-    looks = without_standing_light(views)
-    light = _frames_light(views, looks, names)
-    # A frame in shade fits no other one, with any slip.
+    channels = without_stationary_light(views)
+    light = _frames_light(views, channels, names)
+    # A frame in shade matches no other frame, whatever the slip.
     shaded = {name for finding in light if finding.level == "red" for name in finding.values}
-    return [*light, *_frames_slip(views, looks, names, shaded)]
+    return [*light, *_frames_slip(views, channels, names, shaded)]
 
 
-def without_standing_light(views: PointViews) -> Float[np.ndarray, "n channels"]:
-    """Logarithm of each view's brightness, and of its colours over it, less what goes with the direction it faces."""
+def without_stationary_light(views: PointViews) -> Float[np.ndarray, "n channels"]:
+    """Logarithm of each view's brightness and of its colours over it, without what its direction explains."""
     log = np.log(np.maximum(views.reflectance, 1e-3))
     brightness = log.mean(axis=1, keepdims=True)
     channels = np.concatenate([brightness, log - brightness], axis=1)
@@ -77,11 +89,13 @@ def without_standing_light(views: PointViews) -> Float[np.ndarray, "n channels"]
     return channels - of_cell[cell]
 
 
-def _frames_light(views: PointViews, looks: Float[np.ndarray, "n channels"], names: Sequence[str]) -> list[Finding]:
+def _frames_light(
+    views: PointViews, channels: Float[np.ndarray, "n channels"], names: Sequence[str]
+) -> list[Finding]:
     """Frames in which the object is brighter or darker than in the others, as a whole or in parts."""
     numbers, cell = np.unique(views.frame), facing_cell(views)
-    of_point = mean_by_index(looks[:, 0], views.point, len(views.positions_m))
-    rest = looks[:, 0] - of_point[views.point]
+    of_point = mean_by_index(channels[:, 0], views.point, len(views.positions_m))
+    rest = channels[:, 0] - of_point[views.point]
     level, patches = np.zeros((2, len(numbers)))
     for row, number in enumerate(numbers):
         own, cells = rest[views.frame == number], cell[views.frame == number]
@@ -99,7 +113,7 @@ def _frames_light(views: PointViews, looks: Float[np.ndarray, "n channels"], nam
     changes = {names[numbers[row]]: round(float(max(level[row], patches[row])), 4) for row in named}
     percent = 100.0 * -np.expm1(-max(changes.values()))
     sentence = (
-        f"The object is lit otherwise in {names_in_short([*changes])} than in the other frames, by up to "
+        f"The light on the object in {names_in_short([*changes])} differs from that in the other frames by up to "
         f"{percent:.0f} %: a shadow fell on it, or a lamp changed or moved"
     )
     few = len(named) < FEW * len(numbers)
@@ -108,52 +122,52 @@ def _frames_light(views: PointViews, looks: Float[np.ndarray, "n channels"], nam
 
 
 def _frames_slip(
-    views: PointViews, looks: Float[np.ndarray, "n channels"], names: Sequence[str], shaded: set[str]
+    views: PointViews, channels: Float[np.ndarray, "n channels"], names: Sequence[str], shaded: set[str]
 ) -> list[Finding]:
     """Successive frames whose points match better where the object is turned on the disc between them."""
     numbers = [number for number in np.unique(views.frame) if names[number] not in shaded]
     pairs = list(zip(numbers, [*numbers[1:], numbers[0]], strict=True))
     by_frame = {number: np.flatnonzero(views.frame == number) for number in numbers}
-    scatter = _scatter(views, looks, [(by_frame[a], by_frame[b]) for a, b in pairs])
+    scatter = _scatter(views, channels, [(by_frame[a], by_frame[b]) for a, b in pairs])
     if scatter is None:
         return []
     slipped = {}
     for first, second in pairs:
-        slip_deg, fit = slip_between(views, looks / scatter, by_frame[first], by_frame[second])
+        slip_deg, fit = slip_between(views, channels / scatter, by_frame[first], by_frame[second])
         if fit < SLIP_FIT and abs(slip_deg) >= LEAST_SLIP_DEG:
             slipped[f"{names[first]} to {names[second]}"] = slip_deg
     directions = np.sign([*slipped.values()])
     if not slipped or (len(slipped) > MOST_SLIPS * len(pairs) and abs(directions.mean()) > ONE_DIRECTION):
         return []
-    told = ", ".join(f"{pair} (by about {abs(deg):.0f} degrees)" for pair, deg in list(slipped.items())[:3])
+    slips = ", ".join(f"{pair} (by about {abs(deg):.0f} degrees)" for pair, deg in list(slipped.items())[:3])
     sentence = (
-        f"The object turned on the disc from {told}: its texture moved otherwise than the markers; fix it and take "
-        "the session again, or leave out the frames before or after with --exclude."
+        f"The object slipped on the disc from {slips}: its texture moved differently from the markers; fasten it and "
+        "take the session again, or leave out the frames before or after with --exclude."
     )
     return [Finding("frames-slip", "red", sentence, {"slip_deg": slipped})]
 
 
 def _scatter(
-    views: PointViews, looks: np.ndarray, pairs: Sequence[tuple[np.ndarray, np.ndarray]]
+    views: PointViews, channels: np.ndarray, pairs: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> Float[np.ndarray, "channels"] | None:
     """Usual scatter of the channels between neighbouring points of successive frames; None with too few points."""
     found = []
     for first, second in pairs:
         tree = _tree_of(views, first)
-        change = _change(views, looks, tree, first, second, float(SLIPS_DEG[len(SLIPS_DEG) // 2 + 1]))
+        change = _change(views, channels, tree, first, second, float(SLIPS_DEG[len(SLIPS_DEG) // 2 + 1]))
         if change is not None:
             found.append(median_abs_deviation(change, scale="normal"))
     return np.maximum(np.median(found, axis=0), LEAST_SCATTER) if found else None
 
 
 def slip_between(
-    views: PointViews, looks: Float[np.ndarray, "n channels"], first: np.ndarray, second: np.ndarray
+    views: PointViews, channels: Float[np.ndarray, "n channels"], first: np.ndarray, second: np.ndarray
 ) -> tuple[float, float]:
     """Turn of the object about the axis from one frame to another by which its points fit best.
 
     Args:
         views: all of them.
-        looks: of each, in units of their scatter.
+        channels: of each, in units of their scatter.
         first, second: rows of the two frames.
 
     Returns:
@@ -161,7 +175,7 @@ def slip_between(
     """
     tree, differences = _tree_of(views, first), []
     for slip_deg in SLIPS_DEG:
-        change = _change(views, looks, tree, first, second, float(slip_deg))
+        change = _change(views, channels, tree, first, second, float(slip_deg))
         differences.append(np.inf if change is None else float(np.minimum(change**2, LARGEST_SIGMAS**2).mean()))
     none, best = len(SLIPS_DEG) // 2, int(np.argmin(differences))
     if not np.isfinite(differences[none]):
@@ -175,7 +189,7 @@ def _tree_of(views: PointViews, rows: np.ndarray) -> cKDTree:
 
 def _change(
     views: PointViews,
-    looks: Float[np.ndarray, "n channels"],
+    channels: Float[np.ndarray, "n channels"],
     tree: cKDTree,
     first: np.ndarray,
     second: np.ndarray,
@@ -188,9 +202,41 @@ def _change(
     # What is now at a point was before at the point that the slip brings there.
     before = rotations_about_z(np.deg2rad([-slip_deg]))[0]
     points = views.positions_m[views.point[second]] @ before.T
-    away, nearest = tree.query(points, distance_upper_bound=MATCHED_M)
-    near = np.isfinite(away)
+    distance_m, nearest = tree.query(points, distance_upper_bound=MATCHED_M)
+    near = np.isfinite(distance_m)
     if near.sum() < FEWEST_POINTS:
         return None
-    change = looks[second[near]] - looks[first[nearest[near]]]
+    change = channels[second[near]] - channels[first[nearest[near]]]
     return change - np.median(change, axis=0)
+
+
+def check_band_order(
+    spectrum: Float[np.ndarray, "bands"], wavelengths_nm: Float[np.ndarray, "bands"]
+) -> list[Finding]:
+    """The finding ``band-order`` where the object is far brighter in the blue than in the infrared.
+
+    Args:
+        spectrum: the object's mean reflectance.
+        wavelengths_nm: of its bands.
+
+    Example:
+        >>> check_band_order(np.array([0.6, 0.1]), np.array([450.0, 900.0]))[0].level
+        'red'
+    """
+    in_blue, in_infrared = (
+        (wavelengths_nm >= low) & (wavelengths_nm <= high) for low, high in (BLUE_NM, INFRARED_NM)
+    )
+    if not (in_blue.any() and in_infrared.any()):
+        return []
+    blue, infrared = float(spectrum[in_blue].mean()), float(spectrum[in_infrared].mean())
+    ratio = blue / max(infrared, 1e-3)
+    if blue < LEAST_BLUE or ratio <= ORDER_AMBER:
+        return []
+    level: Level = "red" if ratio > ORDER_RED else "amber"
+    sentence = (
+        f"The object reflects {100.0 * blue:.0f} % from {BLUE_NM[0]:g} to {BLUE_NM[1]:g} nm and "
+        f"{100.0 * infrared:.0f} % from {INFRARED_NM[0]:g} to {INFRARED_NM[1]:g} nm, unlike plants and nearly all "
+        "pigments: the headers probably list the wavelengths in reverse; compare them with a leaf, which is dark at "
+        "680 nm and bright from 750 nm, and correct them."
+    )
+    return [Finding("band-order", level, sentence, {"blue_over_infrared": ratio})]

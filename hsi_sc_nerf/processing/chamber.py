@@ -1,8 +1,7 @@
-"""The chamber behind the turntable: its median spectrum, and whether it stands still.
+"""The chamber behind the turntable: its median spectrum, and whether an image of it is a better background.
 
-It stands still where a picture of it tells more than that spectrum.
-
-What of an image the turntable covers, its disc and the container, turns with the object.
+An image is better if the chamber is stationary and uneven. Pixels that show the turntable's disc or the container are
+left out, because these turn with the object.
 """
 
 from __future__ import annotations
@@ -29,11 +28,11 @@ MAX_SIDE = 64
 OUTLINE_PX = 3
 """Pixels within this of the object or the turntable are left out."""
 FEWEST_OTHERS = 2
-"""Other frames that have to show the chamber at a pixel."""
+"""A pixel is compared if more than this many other frames show the chamber there."""
 FEWEST_PIXELS = 16
 TRIMMED = 0.02
-"""Fraction of the pixels that is left out: those unlike the chamber's spectrum, such as a stem on the axis that the
-masks miss."""
+"""Fraction of the pixels that is left out: those least like the chamber's spectrum, such as a stem on the axis that
+the masks miss."""
 _BORDER_FRACTION = 1 / 32
 
 
@@ -57,9 +56,10 @@ def background_pixels(
 def gain_of_background_image(
     spectra: Float[np.ndarray, "frames pixels colours"], free: Bool[np.ndarray, "frames pixels"]
 ) -> Change | None:
-    """What the other frames' medians at a pixel predict better than the median of all, root mean square reflectance.
+    """How much better an image of the chamber predicts a frame than its median spectrum, RMS reflectance.
 
-    0 where the chamber is even, and where it moves. None where too little of it is seen.
+    The image is the median of the other frames at each pixel. The gain is 0 if the chamber is even or moves, and None
+    if too little of it is visible.
     """
     shown = np.where(free[..., None], spectra, np.nan)
     known = free & (free.sum(axis=0) > FEWEST_OTHERS)
@@ -73,9 +73,9 @@ def gain_of_background_image(
     gains = []
     for frame in frames:
         pixels = known[frame]
-        picture = np.nanmedian(np.delete(shown[:, pixels], frame, axis=0), axis=0)
-        seen = shown[frame, pixels]
-        gains.append(float(((seen - spectrum) ** 2 - (seen - picture) ** 2).mean()))
+        image = np.nanmedian(np.delete(shown[:, pixels], frame, axis=0), axis=0)
+        measured = shown[frame, pixels]
+        gains.append(float(((measured - spectrum) ** 2 - (measured - image) ** 2).mean()))
     return change_of(gains, known[frames].sum(axis=1))
 
 

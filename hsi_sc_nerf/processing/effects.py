@@ -1,6 +1,7 @@
-"""The effects that a session calls for, from what is known at the end of its processing.
+"""Which effects the model simulates for a session, decided at the end of its processing.
 
-What calibration and poses have decided is reported with their own evidence; the rest is measured here.
+Calibration and poses have already decided some effects, which are reported with their evidence. The others are
+measured here.
 """
 
 from __future__ import annotations
@@ -29,17 +30,17 @@ from hsi_sc_nerf.processing.view_changes import (
     change_with_height,
     point_views,
 )
-from hsi_sc_nerf.processing.voted_hull import VotedHull
+from hsi_sc_nerf.processing.visual_hull import VotedHull
 from hsi_sc_nerf.terminal import screen_table
 
 LEAST_VIEW_CHANGE_PERCENT = 0.5
-"""Poses that are wrong by a pixel make up to 0.3 % of a bumpy object."""
+"""On a bumpy object, poses that are wrong by a pixel cause changes of up to 0.3 %."""
 LEAST_PICTURE = 0.005
-"""Reflectance; the noise of a pixel is larger."""
+"""Least gain of an image of the chamber, reflectance; the noise of a pixel is larger."""
 LEAST_HEIGHT_CHANGE_PERCENT = 2.0
-"""A colour that goes with the height, as an apple's, leaves a tenth of that in even light."""
+"""In even light, a colour that varies with the height, as an apple's, causes a tenth of this."""
 LEAST_POSE_ERROR_PX = 0.1
-"""What training corrects poses to at best; better ones it makes worse (docs/notes/dead_ends.md)."""
+"""Training corrects poses to this at best, and makes better poses worse (docs/notes/dead_ends.md)."""
 FEWEST_POINT_VIEWS = 500
 LARGEST_DRAWN = 100.0
 _LOG_P_NOISE = 0.43
@@ -88,45 +89,45 @@ def measure_effects(
 
 
 def view_dependence(change: Change | None) -> Effect:
-    """Whether points look different from view to view: gloss, or lamps before which they turn."""
+    """Whether points look different from view to view, because of gloss or of lamps under which they turn."""
     if change is None:
-        sentence = "Too little of the object is seen to tell, so that it is simulated."
+        sentence = "Too little of the object is visible to decide, so the model shades points by direction."
         return Effect("view_dependence", True, None, None, None, "%", sentence)
     percent, noise = 100.0 * change.rms, 100.0 * change.noise
     return _decided(
         *("view_dependence", percent, noise, LEAST_VIEW_CHANGE_PERCENT, "%"),
-        "Points change their brightness with the direction that they face in the chamber, so that the model shades "
-        "them by it.",
-        "Points look the same from all sides, so that the model does not shade them.",
+        "Points change their brightness with the direction that they face in the chamber, so the model shades them "
+        "by direction.",
+        "Points look the same from all sides, so the model does not shade them.",
     )
 
 
 def still_chamber(change: Change | None) -> Effect:
-    """Whether a picture of the chamber tells more than its median spectrum."""
+    """Whether an image of the chamber is a better background than its median spectrum."""
     if change is None:
-        sentence = "Too little of the chamber is seen to tell, so that its median spectrum is taken."
+        sentence = "Too little of the chamber is visible to decide, so its median spectrum is the background."
         return Effect("still_chamber", False, None, None, None, "reflectance", sentence)
     return _decided(
         *("still_chamber", change.rms, change.noise, LEAST_PICTURE, "reflectance"),
-        "The chamber stands still and is uneven, so that its picture is the background.",
-        "The chamber is even or does not stand still, so that its median spectrum is the background.",
+        "The chamber is stationary and uneven, so its image is the background.",
+        "The chamber is even or moves, so its median spectrum is the background.",
     )
 
 
 def pose_refinement(poses: TurntablePoses, object_box_m: Float[np.ndarray, "2 3"]) -> Effect:
-    """Whether the poses are so uncertain that training can improve them: what that moves the object's surface by."""
+    """Whether training can improve the poses: whether their uncertainty moves the object's surface by enough."""
     if poses.uncertainty is None:
         refined = poses.method != "markers"
         what = "training refines them" if refined else "training does not refine them"
-        sentence = f"How uncertain the poses are is not known; poses by {poses.method}: {what}."
+        sentence = f"The uncertainty of the poses is not known; for poses by {poses.method}, {what}."
         return Effect("pose_refinement", refined, None, None, None, "px", sentence)
     radius_m = float(np.abs(object_box_m[:, :2]).max())
     distance_m = float(np.linalg.norm(poses.camera_to_world[poses.used, :2, 3], axis=1).mean())
     error_px = poses.intrinsics.fl_x / distance_m * radius_m * np.deg2rad(poses.uncertainty.rotation_deg)
     return _decided(
         *("pose_refinement", float(error_px), 0.0, LEAST_POSE_ERROR_PX, "px"),
-        "The poses' own uncertainty moves the surface by more than training leaves, so that training refines them.",
-        "The poses are better than training would make them, so that they stay.",
+        "The poses are less certain than those that training finds, so training refines them.",
+        "The poses are more certain than those that training finds, so they are kept.",
     )
 
 
@@ -168,7 +169,7 @@ def saturated_highlights(dataset: PackedDataset, masks: Bool[np.ndarray, "frames
         for frame, mask in zip(dataset.frames, masks, strict=True)
     )
     one_percent = max(int(masks.sum()), 1) / 100.0
-    return _decided(  # one pixel is there
+    return _decided(  # a single pixel is enough
         *("saturated_highlights", saturated / one_percent, 0.0, 0.5 / one_percent, "% of pixels"),
         "Some of the object's pixels are saturated, and their saturated values are left out.",
         "No pixel of the object is saturated.",
@@ -176,12 +177,12 @@ def saturated_highlights(dataset: PackedDataset, masks: Bool[np.ndarray, "frames
 
 
 def spectral_rank(dataset: PackedDataset) -> Effect:
-    """How many spectra span all others above the noise; training finds them anew in its own frames."""
+    """Number of spectra that span all others above the noise; training determines it again from its own frames."""
     bands = len(dataset.wavelengths_nm)
     try:
         rank = training_subspace(dataset, dataset.frames).basis.shape[1]
     except InputError:
-        sentence = "Too few spectra are free of flagged values to tell."
+        sentence = "Too few spectra are free of flagged values to determine the rank."
         return Effect("spectral_rank", False, None, None, None, "spectra", sentence)
     sentence = f"{rank} spectra span those of all {bands} bands above the noise, and the field emits {rank} numbers."
     return Effect("spectral_rank", rank < bands, float(rank), None, 1.0, "spectra", sentence)
@@ -190,19 +191,19 @@ def spectral_rank(dataset: PackedDataset) -> Effect:
 def uneven_light(seen: PointViews | None) -> Effect:
     """A hint only: `hsi-sc-nerf material` decides it after training, when the surface is known."""
     if seen is None:
-        sentence = "Too little of the object is seen to tell; `material` decides after training."
+        sentence = "Too little of the object is visible to decide; `material` decides after training."
         return Effect("uneven_light", False, None, None, None, "%", sentence)
     change = change_with_height(seen)
     return _decided(
         *("uneven_light", 100.0 * change.rms, 100.0 * change.noise, LEAST_HEIGHT_CHANGE_PERCENT, "%"),
-        "Like spectra differ in brightness by height and slope, as in shade; `material` decides after training.",
-        "Like spectra are equally bright at all heights; `material` decides after training.",
+        "Similar spectra differ in brightness by height and slope, as in shade; `material` decides after training.",
+        "Similar spectra are equally bright at all heights; `material` decides after training.",
     )
 
 
 def show_effects(console: Console, effects: Sequence[Effect]) -> None:
     """Print the effects as a table, and what they mean."""
-    console.print(screen_table(EFFECT_COLUMNS, effect_rows(effects), title="What the session calls for"))
+    console.print(screen_table(EFFECT_COLUMNS, effect_rows(effects), title="Effects in the session"))
     for effect in effects:
         console.print(f"{effect.name}: {effect.sentence}", highlight=False, markup=False, soft_wrap=True)
 
@@ -236,7 +237,7 @@ def draw_effects(path: Path, effects: Sequence[Effect]) -> None:
 def _decided(
     name: str, evidence: float, noise: float, least: float, unit: str, if_present: str, if_absent: str
 ) -> Effect:
-    """The effect by evidence that has to exceed both a least size and its noise."""
+    """The effect, which is present if its evidence exceeds both a least size and its noise."""
     threshold = max(least, CERTAIN * noise)
     present = evidence > threshold
     return Effect(name, present, evidence, noise, threshold, unit, if_present if present else if_absent)
@@ -244,7 +245,8 @@ def _decided(
 
 def _by_poses(poses: TurntablePoses, name: str, present: bool, does: str) -> Effect:
     if name not in poses.evidence:
-        sentence = f"Poses by {poses.method} do not look for it{f', but it is known: it {does}' if present else ''}."
+        known = f", but it is known: it {does}" if present else ""
+        sentence = f"Poses by {poses.method} are not tested for it{known}."
         return Effect(name, present, None, None, None, "-log10 p", sentence)
-    sentence = f"It {does}, and the poses count it." if present else "The markers do not call for it."
+    sentence = f"It {does}, and the poses include it." if present else "The markers show no sign of it."
     return Effect(name, present, poses.evidence[name], _LOG_P_NOISE, EVIDENCE_NEEDED, "-log10 p", sentence)

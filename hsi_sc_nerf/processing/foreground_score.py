@@ -62,7 +62,7 @@ def smoothed_bins(binned: Float[np.ndarray, "bins h w"]) -> Float16[np.ndarray, 
 def background_subspace(
     bins: Sequence[Float[np.ndarray, "bins h w"]], regions: Bool[np.ndarray, "frames h w"] | None = None
 ) -> Float[np.ndarray, "bins rank"]:
-    """Orthonormal basis of flat spectra and of the smallest number of components that tells the object well.
+    """Orthonormal basis of flat spectra and of the smallest number of components that separates the object well.
 
     Args:
         bins: of each frame (`smoothed_bins`).

@@ -1,8 +1,8 @@
 """Frames of a session, calibrated and packed side by side; a run that stopped goes on where it was.
 
 A frame's cube and pictures are written first and its cache last, so a frame with a cache is finished. An earlier
-cache is deleted before the first of its files is replaced: it would vouch for a cube of other settings.
-Fingerprints of files and settings tell whether an earlier run had the same input.
+cache is deleted before the first file is replaced, so that no cache belongs to a cube of other settings. An earlier
+run had the same input if the fingerprints of files and settings are equal.
 """
 
 from __future__ import annotations

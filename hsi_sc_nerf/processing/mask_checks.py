@@ -24,15 +24,15 @@ MAX_ODDITY, ODDITY_SIGMAS = 0.015, 5.0
 """Largest excess of one frame's difference over the typical one, to which an eighth of a pixel is added; and the same
 in standard deviations of the frames' differences, for noise frays masks."""
 BACKGROUND_SIGMAS = 3.0
-"""Departure from what other frames show in a pixel, in standard deviations of theirs, up to which it is the same."""
+"""A pixel shows the same as in the other frames up to this deviation, in their standard deviations."""
 STILL_OVERLAP = 0.97
-"""Intersection over union of all masks from which they stand still."""
+"""Intersection over union of all masks from which they count as stationary."""
 STILL_FRACTION = 0.7
 """Fraction of the masks' edge that must not change for it to be the background's."""
 PIECES_FRACTION = 0.25
 """Fraction of the frames that show a piece beside the masked ones, from which it is no passing spot."""
 STANDING_FRACTION = 0.5
-"""Fraction of the middle of the lid that what stands on it hides."""
+"""Fraction of the lid's middle that is hidden by an object on it."""
 
 
 def check_masks(
@@ -44,7 +44,7 @@ def check_masks(
     regions: Bool[np.ndarray, "frames h w"] | None = None,
     lid_middles: Bool[np.ndarray, "frames h w"] | None = None,
 ) -> list[Finding]:
-    """What speaks against the masks; nothing for good ones.
+    """Findings on the masks; none for good ones.
 
     Args:
         silhouettes: of the masks' visual hull (`VotedHull`).
@@ -113,9 +113,10 @@ def _still(
     brightness: Float[np.ndarray, "frames h w"],
     lid_middles: Bool[np.ndarray, "n h w"] | None,
 ) -> list[Finding]:
-    """Masks that are the same in all frames and show the same at their edge: of what does not turn.
+    """Masks that are the same in all frames and show the same at their edge: they are of something stationary.
 
-    A body of revolution looks like that as well. It stands on the lid and hides its middle; a wall is behind the lid.
+    A body of revolution has such masks as well, but it stands on the lid and hides its middle. A wall is behind the
+    lid.
     """
     if lid_middles is not None and (masks & lid_middles).sum() > STANDING_FRACTION * lid_middles.sum():
         return []
@@ -131,7 +132,7 @@ def _still(
     if still < STILL_FRACTION:
         return []
     sentence = (
-        "The masks and what they show at their edge stand still while the table turns, so they are probably the "
+        "The masks and the image at their edge are stationary while the table turns, so they are probably the "
         "wall's; look at report/masks.png and set --masks.threshold, or accept it for a smooth body of revolution on "
         "no known container."
     )

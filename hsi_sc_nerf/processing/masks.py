@@ -1,10 +1,10 @@
 """Foreground masks: the object on its container, without chamber, container, disc and markers.
 
 Otsu's threshold separates the object's foreground scores from the others. What lies below the container's lid is
-excluded by geometry. The edge is decided locally: parts of the object in shade, and mixed pixels, which count if half
-of them is the object. Light scales foreground score and brightness alike, so their ratio tells the material in any
-light. The score of a mixed pixel is its fraction of object times the score of the object beside it, whatever the
-background is.
+excluded by geometry. The edge is decided locally: parts of the object in shade belong to it, and so do mixed pixels
+of which the object covers at least half. Light scales foreground score and brightness by the same factor, so their
+ratio depends on the material alone. The score of a mixed pixel is its fraction of object times the score of the
+object beside it, whatever the background is.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ CLOSING_FRACTION = 0.01
 COLUMNS, TILE_PX = 6, 240
 """Frames in a row of the contact sheet, and the width of each."""
 NEARBY_PX = 2.0
-"""Standard deviation of the Gaussian weights with which what is next to a pixel is averaged."""
+"""Standard deviation of the Gaussian weights of averages over a pixel's neighbourhood."""
 HALF_COVERED = 0.5
 """Score of a pixel that is half object, relative to the object beside it."""
 GROWTH_PX = 2
-"""Pixels by which the edge may move outwards: gaps between the global threshold and half of a low local score."""
+"""Pixels by which the edge may move outwards where the local score is low and the global threshold too high."""
 # Fractions of the object's median brightness: a background brighter than the first makes all mixed pixels bright;
 # darker pixels than the second have noisy ratios.
 _BRIGHT_BACKGROUND = 0.9
@@ -63,7 +63,7 @@ class MaskConfig:
     """Parts that stick out of the object (a stem) are added from this fraction of the threshold; 1 for none."""
     shaded_fraction: float | None = 0.5
     """Pixels next to the object and darker than it are added where their score relative to their brightness is more
-    than this fraction of the object's; None for none. Not applied next to what is darker still."""
+    than this fraction of the object's; None for none. Not applied next to even darker pixels."""
     overhang: float = 1.2
     """The object may reach beyond the container's lid up to this multiple of the lid's radius."""
     pieces: int = 1
@@ -130,7 +130,7 @@ def select_threshold(scores: Sequence[Float[np.ndarray, "h w"]], threshold: floa
     threshold, contrast, separation = otsu_threshold(scores)
     if contrast < MIN_CONTRAST or separation < MIN_SEPARATION:
         raise InputError(
-            f"no object can be told from the background in these frames (contrast {contrast:.3f}); check that the "
+            f"no object stands out from the background in these frames (contrast {contrast:.3f}); check that the "
             "object is in view, or give a threshold with --masks.threshold."
         )
     return threshold

@@ -1,4 +1,4 @@
-"""Poses of a session's frames: the checks before, the search, the report, and the frames of the dataset."""
+"""Poses of a session's frames: found, checked and reported, and the frames of the dataset that have one."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from hsi_sc_nerf.poses.pose_methods import PoseMethod
 from hsi_sc_nerf.poses.report import check_poses, describe_poses, draw_poses, pose_report
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.session_pictures import GRAY, read_pictures
-from hsi_sc_nerf.processing.frames import FramePaths
+from hsi_sc_nerf.processing.frames import MARKER_RANGE_NM, FramePaths
 
 _log = logging.getLogger(__name__)
 
@@ -40,7 +40,7 @@ def pose_frames(
     output_dir: Path,
     console: Console,
     find_poses: PoseFunction,
-    marker_range_nm: tuple[float, float] = (450.0, 700.0),
+    marker_range_nm: tuple[float, float] = MARKER_RANGE_NM,
     check: Callable[[Sequence[Finding]], None] = refuse_red,
 ) -> TurntablePoses:
     """Find and check the poses, write ``poses.json`` and its figure, and print what was found.
@@ -55,7 +55,7 @@ def pose_frames(
         InputError: no method finds poses, a check of them is red, or the operating system refused to write.
     """
     names = [capture.name for capture in session.frames]
-    # Known angles before a known camera need no images.
+    # Known angles with a known camera need no images.
     pictures = None
     if method != "angles" or camera is None:
         paths = [FramePaths.of(output_dir, name) for name in names]
@@ -119,7 +119,7 @@ def posed_frames(output_dir: Path, poses: TurntablePoses) -> list[PackedFrame]:
 
 
 def container_under(session: Session, poses: TurntablePoses) -> Container | None:
-    """The container, where its size is known and the object frame is such that it stands on z = 0 and in metres."""
+    """The container, if its size is known and the object frame is in metres with the container on z = 0."""
     diameter_m, height_m = session.info.container_diameter_m, session.info.container_height_m
     seen = bool(poses.disc_markers) or poses.disc_by_container
     feet_known = seen or poses.method == "markers" or not np.isfinite(poses.overall_error_px)
@@ -132,7 +132,7 @@ def known_camera(earlier: PackedDataset) -> KnownCamera:
     """The camera of a dataset that was made before with the same camera and turntable, at the angle 0."""
     first = earlier.frames[0]
     k1, k2, p1, p2 = (float(c) for c in earlier.distortion)
-    # The sign of the angles tells the direction, unless both signs occur.
+    # The sign of the angles gives the direction, unless both signs occur.
     forward = {frame.angle_deg > 0.0 for frame in earlier.frames if frame.angle_deg != 0.0}
     return KnownCamera(
         intrinsics=earlier.intrinsics,

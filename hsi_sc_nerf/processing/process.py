@@ -33,8 +33,7 @@ from hsi_sc_nerf.packed.dataset import (
 )
 from hsi_sc_nerf.poses.pose_methods import PoseMethod, find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
-from hsi_sc_nerf.processing.appearance_checks import check_appearance
-from hsi_sc_nerf.processing.band_order import check_band_order
+from hsi_sc_nerf.processing.appearance_checks import check_appearance, check_band_order
 from hsi_sc_nerf.processing.chamber import background_spectrum
 from hsi_sc_nerf.processing.effects import draw_effects, measure_effects, points_of_object, show_effects
 from hsi_sc_nerf.processing.frames import (
@@ -48,7 +47,7 @@ from hsi_sc_nerf.processing.mask_checks import check_masks
 from hsi_sc_nerf.processing.masks import MaskConfig, above_lid, foreground_masks, lid_middle, mask_picture
 from hsi_sc_nerf.processing.posed_frames import PoseFunction, container_under, known_camera, pose_frames, posed_frames
 from hsi_sc_nerf.processing.session_checks import SessionChecks, require_checks
-from hsi_sc_nerf.processing.voted_hull import VotedHull, assumed_disc, object_box, scene_box, voted_hull
+from hsi_sc_nerf.processing.visual_hull import VotedHull, assumed_disc, object_box, scene_box, voted_hull
 from hsi_sc_nerf.spectra import nearest_bands
 
 OBJECT_PIXELS = 2000
@@ -195,7 +194,7 @@ def process_session(
         pose_method=poses.method,
         fingerprint=fingerprint,
     )
-    with console.status("looking for the effects that the session calls for"):
+    with console.status("measuring the effects in the session"):
         bins = BinsOfFrames(caches)
         seen = points_of_object(dataset, bins, masks, hull)
         checks.add([] if seen is None else check_appearance(seen, [frame.capture for frame in frames]))
@@ -326,7 +325,7 @@ def _boxes(
     container: Container | None,
     console: Console,
 ) -> tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "2 3"]]:
-    """The boxes of the object and of everything that turns; print what they rest on."""
+    """The boxes of the object and of everything that turns; print what is assumed for them."""
     object_box_m = object_box(hull, None if container is None else container.height_m)
     size_mm = " x ".join(f"{1000.0 * side:.0f}" for side in np.diff(object_box_m, axis=0)[0])
     console.print(f"Object: inside a box of {size_mm} mm.")

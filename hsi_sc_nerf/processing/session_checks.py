@@ -1,4 +1,4 @@
-"""The findings of a session's processing: told, kept in one file, and refused where they are red."""
+"""The findings of a session's processing: logged, collected in one file, and refused if red and not accepted."""
 
 from __future__ import annotations
 
@@ -27,16 +27,14 @@ MAY_BE_RED = (
 
 
 def require_checks(names: Collection[str]) -> None:
-    """Refuse names of checks that there are not.
+    """Refuse names of checks that do not exist.
 
     Raises:
         InputError: one of ``names`` is no check whose finding may be red.
     """
     unknown = [name for name in names if name not in MAY_BE_RED]
     if unknown:
-        raise InputError(
-            f"--accept {unknown[0]}: there is no such check; those that refuse are {', '.join(MAY_BE_RED)}."
-        )
+        raise InputError(f"--accept {unknown[0]}: there is no such check; give one of {', '.join(MAY_BE_RED)}.")
 
 
 class SessionChecks:

@@ -1,10 +1,10 @@
-"""How the brightness of the object's points changes, from view to view and from place to place, before any training.
+"""How the brightness of points on the object changes from view to view and from place to place, before any training.
 
-The points are those of the masks' hull, looked up in the frames.
+The points lie on the visual hull of the masks and are looked up in the frames.
 
-What changes with the direction that a point faces in the camera's frame is light or gloss that stands still with the
-camera. It is fitted beside each frame's own brightness, and each sector of the object is predicted by the others: the
-object's texture, which wrong poses and a hull beside the surface shift, and noise then count for nothing.
+A change with the direction that a point faces in the camera's frame comes from light or gloss that is stationary with
+the camera. It is fitted together with the brightness of each frame. Each sector of the object is predicted from the
+other sectors. So neither noise contributes nor the object's texture, which wrong poses and an inexact hull shift.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project, project_distorted
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project, project_distorted, unit_vectors
 from hsi_sc_nerf.morphology import dilate
-from hsi_sc_nerf.processing.voted_hull import VotedHull
+from hsi_sc_nerf.processing.visual_hull import VotedHull
 
 NORMAL_CELLS = 6
 """Cells of the normals' directions to the right and upwards in the camera's frame."""
 MOST_CHANGE = 1.0
-"""Relative changes are cut off here: larger ones are the chamber's pixels in a wrong mask."""
+"""Relative changes are limited to this: larger ones come from pixels of the chamber in a wrong mask."""
 ALIKE = 12
-"""A point's brightness is compared with that of so many others of the most similar spectra."""
+"""The brightness of a point is compared with that of this many others, those with the most similar spectra."""
 _RIDGE = 1e-6
 _LEAST_RIDGE = 1e-12
 COLOURS = 6
@@ -34,7 +34,7 @@ COLOURS = 6
 MAX_POINTS = 2000
 MAX_FRAMES = 60
 MAX_INCIDENCE_DEG = 60.0
-"""Points are looked up where they are seen at less than this: towards the outline, pixels mix with the chamber."""
+"""Largest angle at which points are looked up: towards the outline, pixels also cover the chamber."""
 OUTLINE_PX = 2
 """Pixels within this of the mask's edge are left out."""
 SECTORS = 8
@@ -44,7 +44,7 @@ _SMOOTH_VOXELS = 1.5
 
 @dataclass(frozen=True)
 class Change:
-    """A change, root mean square, and the standard deviation of what is found."""
+    """A change (root mean square), and the standard deviation of its estimate."""
 
     rms: float
     noise: float
@@ -75,24 +75,28 @@ def change_with_direction(views: PointViews) -> Change:
 
 
 def change_with_height(views: PointViews) -> Change:
-    """Relative change of brightness with height and slope among points of like spectra.
+    """Relative change of brightness with height and slope among points of similar spectra.
 
-    Light from the chamber's walls and the lid's shade show here, and so does a material whose brightness alone
-    changes with height.
+    It is caused by light from the chamber's walls, by the lid's shade, or by a material whose brightness varies with
+    height while its spectrum's shape does not.
     """
     count = len(views.positions_m)
     spectra = mean_by_index(views.reflectance, views.point, count)
     seen = np.unique(views.point)
     spectra = np.maximum(spectra[seen], 1e-4)
-    brightness = np.log(spectra.mean(axis=1))
-    shapes = spectra / np.linalg.norm(spectra, axis=1, keepdims=True)
-    _, alike = cKDTree(shapes).query(shapes, min(ALIKE + 1, len(seen)))
+    brightness, alike = np.log(spectra.mean(axis=1)), like_spectra(spectra)
     height, slope = (_tertile(values[seen]) for values in (views.positions_m[:, 2], views.normals[:, 2]))
     causes = _indicators(3 * height + slope)
     causes = causes - causes[alike].mean(axis=1)
     response = brightness - brightness[alike].mean(axis=1)
     rows = _rows_of(views.sector[seen])
     return _predicted([[_products(causes[part], response[part]) for part in rows]], causes.shape[1])
+
+
+def like_spectra(spectra: Float[np.ndarray, "n bands"]) -> Int[np.ndarray, "n alike"]:
+    """Rows of the `ALIKE` spectra most similar in shape to each spectrum, and its own row."""
+    shapes = unit_vectors(spectra)
+    return cKDTree(shapes).query(shapes, min(ALIKE + 1, len(shapes)))[1]
 
 
 def facing_cell(views: PointViews) -> Int[np.ndarray, "n"]:
@@ -102,7 +106,7 @@ def facing_cell(views: PointViews) -> Int[np.ndarray, "n"]:
 
 
 def change_of(variances: Sequence[float], sizes: Sequence[int]) -> Change:
-    """The change whose mean square was found several times, independently; negative ones are noise."""
+    """The change from several independent estimates of its mean square; negative estimates are noise."""
     error = float(np.std(variances, ddof=1) / np.sqrt(len(variances)))
     rms = float(np.sqrt(max(np.average(variances, weights=sizes), 0.0)))
     return Change(rms, float(np.sqrt(error)) if rms**2 <= error else error / (2.0 * rms))
@@ -135,14 +139,14 @@ def _products(
 
 
 def _predicted(products: Sequence[Sequence[tuple[np.ndarray, np.ndarray, int]]], first: int) -> Change:
-    """What the first causes, so many, explain in each sector as the other sectors say, over all colours."""
+    """The change explained by the first ``first`` causes in each sector, with effects fitted to the other sectors."""
     explained, sizes = [], []
     for held in range(len(products[0])):
         covariance = 0.0
         for sectors in products:
             square = np.sum([part[0] for k, part in enumerate(sectors) if k != held], axis=0)
             right = np.sum([part[1] for k, part in enumerate(sectors) if k != held], axis=0)
-            # Where all points face alike in all frames there is nothing to explain.
+            # Without variation of the causes the matrix is singular.
             ridge = max(_RIDGE * np.trace(square) / len(square), _LEAST_RIDGE) * np.eye(len(square))
             effects = np.linalg.solve(square + ridge, right)
             own_square, own_right, size = sectors[held]

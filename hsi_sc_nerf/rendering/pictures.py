@@ -138,7 +138,7 @@ def find_false_colour(name: str, wavelengths_nm: Float[np.ndarray, "bands"]) -> 
 
     Raises:
         InputError: there is no such composite or index, no band is near a wavelength that it needs, or a formula
-            does not say what the ends of its colours stand for, which a video's frames have in common.
+            lacks the range of values of its colours, which all frames of a video share.
 
     Example:
         >>> ndvi = find_false_colour("NDVI", run.dataset.wavelengths_nm)
@@ -161,7 +161,7 @@ def find_false_colour(name: str, wavelengths_nm: Float[np.ndarray, "bands"]) -> 
         raise InputError(f"there is no composite (one of {', '.join(COMPOSITES)}) '{name}', and {error}") from error
     require_bands(wavelengths_nm, index.wavelengths_nm, index.name)
     if not index.has_range:
-        raise InputError(f"say what the ends of the colours stand for: '{index.definition} [LOW, HIGH]'.")
+        raise InputError(f"give the values at both ends of the colour scale: '{index.definition} [LOW, HIGH]'.")
     low, high = ends = index.drawn_range
 
     def colours(view: RenderedView) -> Float[Tensor, "h w 3"]:

@@ -109,7 +109,7 @@ def views_of_path(path: Path) -> Views:
 
 @dataclass(frozen=True, eq=False)
 class RenderedView:
-    """What the model shows from one camera.
+    """The model's image from one camera.
 
     Attributes:
         spectral: reflectance; transparent pixels include the background's.
@@ -166,7 +166,7 @@ def write_cube_of_view(
 ) -> None:
     """Write a BIL cube of reflectance ``NAME.hdr`` and ``.raw``.
 
-    A 16-bit cube holds reflectance times `REFLECTANCE_SCALE`, as its header says, and `FLAGGED` where it is NaN.
+    A 16-bit cube holds reflectance times `REFLECTANCE_SCALE`, as its header states, and `FLAGGED` where it is NaN.
 
     Raises:
         InputError: the files cannot be written.

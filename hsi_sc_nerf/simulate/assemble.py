@@ -16,6 +16,7 @@ from jaxtyping import Float
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at
 from hsi_sc_nerf.geometry.mesh import Mesh
+from hsi_sc_nerf.poses.marker_detection import dictionary_by_name, marker_pattern
 from hsi_sc_nerf.simulate import own_mesh, plants
 from hsi_sc_nerf.simulate.effect import effect_rng, find_effect, of_kind
 from hsi_sc_nerf.simulate.effects.motion import FramePlan, MotionEffect, OffCentre
@@ -208,12 +209,10 @@ def marker_layout(scene: Scene) -> MarkerLayout:
 
 def marker_mesh(frame: MarkerFrame, number: int, markers: MarkerSettings) -> tuple[Mesh, np.ndarray]:
     """A marker and its white paper as flat squares, one for each module; and which vertices are ink."""
-    dictionary = aruco_dictionary(markers)
-    modules = dictionary.markerSize + 2
-    image = cv2.aruco.generateImageMarker(dictionary, number, modules, borderBits=1)
+    pattern = marker_pattern(markers.dictionary, number)
     quiet = paper_side_in_markers(markers) / 2.0
-    edges = np.concatenate([[-quiet], np.linspace(-0.5, 0.5, modules + 1), [quiet]])
-    ink = np.pad(image == 0, 1)
+    edges = np.concatenate([[-quiet], np.linspace(-0.5, 0.5, len(pattern) + 1), [quiet]])
+    ink = np.pad(pattern == 0, 1)
     left, top = np.meshgrid(edges[:-1], -edges[:-1])
     right, bottom = np.meshgrid(edges[1:], -edges[1:])
     corners = [(left, bottom), (right, bottom), (right, top), (left, top)]
@@ -235,12 +234,11 @@ def aruco_dictionary(markers: MarkerSettings) -> cv2.aruco.Dictionary:
     Raises:
         InputError: OpenCV has no such dictionary, or it has too few markers.
     """
-    name = markers.dictionary
-    if not name.startswith("DICT_") or not hasattr(cv2.aruco, name):
-        raise InputError(f"markers.dictionary {name!r} is not an ArUco dictionary; use a name like DICT_5X5_50.")
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    dictionary = dictionary_by_name(markers.dictionary)
     if len(dictionary.bytesList) < markers.on_container + markers.on_disc:
-        raise InputError(f"{name} has only {len(dictionary.bytesList)} markers; use fewer or a larger dictionary.")
+        raise InputError(
+            f"{markers.dictionary} has only {len(dictionary.bytesList)} markers; use fewer or a larger dictionary."
+        )
     return dictionary
 
 

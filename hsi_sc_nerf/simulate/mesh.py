@@ -145,7 +145,8 @@ def subdivided(
 def _cut(
     triangles: Int[np.ndarray, "t 3"], middle: Int[np.ndarray, "t 3"], long_edges: int, vertices: np.ndarray
 ) -> Int[np.ndarray, "s 3"]:
-    """Subdivide the triangles with so many long edges; ``middle`` is the midpoint after each corner, or -1."""
+    """Subdivide the triangles that have ``long_edges`` of them; ``middle`` is the midpoint after each corner, or
+    -1."""
     chosen = (middle >= 0).sum(axis=1) == long_edges
     corners, middle = triangles[chosen], middle[chosen]
     # Rotate the corners so that the long edges come first.

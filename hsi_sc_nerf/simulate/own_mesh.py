@@ -71,7 +71,7 @@ def _read_mesh_file(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | No
     if path.suffix.lower() not in FORMATS:
         raise InputError(f"{path}: is not a mesh format that can be read; give one of {', '.join(FORMATS)}.")
     if path.suffix.lower() == ".ply":
-        read_ply(path)  # trimesh believes what a header claims
+        read_ply(path)  # trimesh does not check the counts in a header
     try:
         # UVs of PLY faces would split vertices, which then no longer match the file's vertex properties.
         read = trimesh.load_scene(path, process=False, fix_texture=False).dump()

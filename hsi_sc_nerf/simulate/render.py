@@ -12,7 +12,7 @@ import scipy.sparse
 from jaxtyping import Bool, Float, Int
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, pixel_rays
-from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene
+from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene, rays_for_scene, unoccluded
 from hsi_sc_nerf.simulate.mesh import subdivided
 
 RAYS_AT_ONCE = 2**19
@@ -182,7 +182,7 @@ class Renderer:
         self, origins: Float[np.ndarray, "rays 3"], directions: Float[np.ndarray, "rays 3"], rays_per_pixel: int
     ) -> Hits:
         """First hits of rays with unit directions."""
-        hits = self._scene.cast_rays(_rays(origins, directions))
+        hits = self._scene.cast_rays(rays_for_scene(origins, directions))
         distance_m = hits["t_hit"].numpy()
         ray = np.flatnonzero(np.isfinite(distance_m))
         u, v = hits["primitive_uvs"].numpy()[ray].T
@@ -201,18 +201,13 @@ class Renderer:
         self, origins: Float[np.ndarray, "rays 3"], directions: Float[np.ndarray, "rays 3"]
     ) -> Bool[np.ndarray, "rays"]:
         """Whether rays hit nothing."""
-        return ~self._scene.test_occlusions(_rays(origins, directions)).numpy()
+        return unoccluded(self._scene, origins, directions)
 
     def material_weights(self, hits: Hits) -> Float[np.ndarray, "pixels materials"]:
         """Fraction of each material in each pixel, summing to exactly 1."""
         weights = hits.mix(self.triangles, len(self.weights)) @ self.weights
         weights[:, -1] = 1.0 - weights[:, :-1].sum(axis=1)
         return exact_weights(weights)
-
-
-def _rays(origins: Float[np.ndarray, "rays 3"], directions: Float[np.ndarray, "rays 3"]) -> np.ndarray:
-    """Rays as Open3D takes them: origin and direction in one row, single precision."""
-    return np.concatenate([origins, directions], axis=1, dtype=np.float32)
 
 
 def exact_weights(weights: Float[np.ndarray, "n materials"]) -> Float[np.ndarray, "n materials"]:

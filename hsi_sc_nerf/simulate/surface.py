@@ -11,6 +11,7 @@ import trimesh
 from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 
+from hsi_sc_nerf.geometry.camera import unit_vectors
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate.render import RAY_START_M, Renderer
 
@@ -63,7 +64,7 @@ class Surface:
         return is_object
 
     def surroundings(self, directions: int) -> Surroundings:
-        """What is visible from each point, sampled in so many directions; cached."""
+        """What is visible from each point, sampled in a number of directions; cached."""
         if directions not in self._surroundings:
             self._surroundings[directions] = self._sample_surroundings(directions)
         return self._surroundings[directions]
@@ -143,6 +144,5 @@ def cosine_directions(directions: int, turn: Float[np.ndarray, "p"]) -> Float[np
 def _frames(normals: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3 3"]:
     """Tangent frames: rows are two tangents and the normal."""
     helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
-    tangent = np.cross(helper, normals)
-    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-30)
+    tangent = unit_vectors(np.cross(helper, normals))
     return np.stack([tangent, np.cross(normals, tangent), normals], axis=1)

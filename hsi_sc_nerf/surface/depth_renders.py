@@ -25,8 +25,8 @@ from hsi_sc_nerf.terminal import progress_bar
 MAX_DEPTH_RAYS = 300_000
 """Rays of all depth maps together. If the masks hold more pixels, cells of several pixels share a ray."""
 MARGIN_CELLS = 5
-"""Depth maps reach this far beyond the masks: rays beside the object show that the space there is empty. Without
-them, parts thinner than the truncation distance of the fused mesh would swell."""
+"""Depth maps extend this far beyond the masks: rays beside the object show that the space there is empty. Without
+them, parts thinner than the truncation distance would become thicker in the fused mesh."""
 _DEPTH_TOLERANCE = 0.02
 """A point this far behind the depth map is still visible: about 2 mm."""
 _SLOPE_TOLERANCE = 0.75
@@ -35,14 +35,14 @@ _SLOPE_TOLERANCE = 0.75
 
 @dataclass(frozen=True, eq=False)
 class FrameView:
-    """What one frame sees of points.
+    """Visibility of points in one frame.
 
     Attributes:
-        visible: whether the point is in the picture and the mask, faces the camera, and nothing is before it.
-        beside_mask: the same, but for being beside the mask.
+        visible: whether the point is in the image and in the mask, faces the camera, and nothing occludes it.
+        beside_mask: the same for points beside the mask.
         cosines: of the angle between the point's normal and the direction to the camera.
         xy_px: image coordinates (x, y) from the upper left corner; undefined behind the camera.
-        pixels: (sample, line) that holds the point; (0, 0) outside the picture.
+        pixels: (sample, line) of the point; (0, 0) outside the image.
     """
 
     visible: Bool[Tensor, "n"]
@@ -76,11 +76,11 @@ class DepthRenders:
     points: Float[np.ndarray, "hits 3"]
 
     def views(self, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Iterator[FrameView]:
-        """What each frame, in order, sees of points with outward unit normals."""
+        """Visibility of points with outward unit normals in each frame, in order."""
         return (self.view(frame, points, normals) for frame in range(len(self.depths)))
 
     def view(self, frame: int, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> FrameView:
-        """What one frame sees of points with outward unit normals."""
+        """Visibility of points with outward unit normals in one frame."""
         to_point, xy_px, inside, pixels = self._project(frame, points)
         distance = to_point.norm(dim=-1)
         cosines = -(normals * to_point).sum(dim=-1) / distance
@@ -97,8 +97,8 @@ class DepthRenders:
     ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n 2"], Float[Tensor, "n"]]:
         """The frame that sees each point most from the front, its image coordinates, the cosine.
 
-        The frame is -1 for points that no frame sees, and for those that most frames see beside their masks: what
-        the object stands on, close to where it does.
+        The frame is -1 for points that no frame sees, and for those that most frames see beside their masks: points
+        of the support close to the object.
         """
         best = torch.full((len(points),), MIN_COSINE, dtype=points.dtype, device=points.device)
         frames = torch.full((len(points),), -1, device=points.device)
@@ -115,7 +115,7 @@ class DepthRenders:
     def depth_at(self, frame: int, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
         """Distances of points from a frame's camera, and the depth map at them.
 
-        The depth is NaN where no ray was rendered, and behind what is seen beside the mask: that is not the object.
+        The depth is NaN where no ray was rendered, and behind a surface beside the mask, which is not the object's.
         """
         to_point, _, inside, pixels = self._project(frame, points)
         distances, depths = to_point.norm(dim=-1), self._depth_of(frame, pixels)
@@ -123,11 +123,11 @@ class DepthRenders:
         return distances, torch.where(inside & (in_mask | (distances < depths)), depths, torch.nan)
 
     def pixels_of(self, frame: int, points: Float[Tensor, "n 3"]) -> tuple[Bool[Tensor, "n"], Int[Tensor, "n 2"]]:
-        """Which points lie in a frame's picture, hidden or not, and their pixels (sample, line); else (0, 0)."""
+        """Which points lie in a frame's image, hidden or not, and their pixels (sample, line); (0, 0) for others."""
         return self._project(frame, points)[2:]
 
     def _project(self, frame: int, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Vectors from the camera to points, image coordinates, whether these are in the picture, and pixels."""
+        """Vectors from the camera to points, image coordinates, whether these lie in the image, and pixels."""
         pose, intrinsics = self.camera_to_world[frame], self.intrinsics
         to_point = points - pose[:3, 3]
         rotation = pose[:3, :3].reshape(9).expand(len(points), 9)

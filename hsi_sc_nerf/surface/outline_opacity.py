@@ -1,13 +1,13 @@
 """Opacity that a model renders where the object covers half of a pixel, measured at the outlines of training frames.
 
-A pixel on the outline shows the object in a part of its area, its coverage. The measured spectrum tells how large it
-is: it lies between the chamber's spectrum beside the outline and the object's inside of it. A trained model may
-render the same spectrum by more of a paler object, because nothing but the pixel's spectrum is taught there. So half
-a coverage is not half an opacity in general, and the surface is looked for at the opacity that is measured.
+The object covers only a part of a pixel on its outline. This coverage follows from the measured spectrum, which lies
+between the spectrum of the chamber outside the outline and that of the object inside it. A trained model may render
+the same spectrum with more of a paler object, because it is trained on the pixel's spectrum alone. So half a coverage
+is in general not an opacity of one half, and the surface is placed at the measured opacity.
 
-Gloss makes the rim of an object resemble the chamber, which is mirrored there, and a lamp in front leaves the rim
-darker than what faces it. No coverage can be told then. Both show in the rim's whole pixels as well, which are
-brighter or darker than those further inside.
+The coverage cannot be measured if the rim of the object has another brightness than its inside. Gloss makes the rim
+resemble the chamber, which it mirrors, and a lamp in front leaves it darker. Both also change the rim's pixels that
+the object covers completely, which are therefore compared with pixels further inside.
 """
 
 from __future__ import annotations
@@ -19,27 +19,29 @@ import torch
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
+from hsi_sc_nerf.geometry.camera import unit_vectors
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.packed.pixels import PixelSampler
 from hsi_sc_nerf.processing.chamber import turntable_silhouette
 from hsi_sc_nerf.surface.surface_depth import camera_rays
 
 HALF = 0.5
-"""Opacity at half a coverage where it cannot be measured: that of a model that renders the coverage itself."""
+"""Opacity at half coverage if it cannot be measured: that of a model that renders the coverage itself."""
 PLAUSIBLE_OPACITY = (0.3, 0.8)
 MEASURED_COVERAGE = (0.4, 0.6)
 FEWEST_PIXELS = 50
 MOST_PIXELS, MOST_FRAMES = 10_000, 24
 LEAST_CONTRAST = 0.05
-"""Root mean square over the bands between object and chamber, reflectance: less tells no coverage."""
+"""Least difference between object and chamber, reflectance (RMS over the bands), with which coverage is measured."""
 OUTLINE_PX = (-1.5, 1.5)
-"""Depths inside the mask at which pixels may be covered in part."""
+"""Depths inside the mask at which the object may cover a part of a pixel."""
 RIM_PX = (1.5, 2.5)
-"""Depths of the first pixels that are covered wholly."""
+"""Depths of the outermost pixels that the object covers completely."""
 PURE_PX, DEEP_PX = 2.5, 5.0
-"""Spectra of the object and the chamber are taken this far from the outline; those that the rim is compared with."""
+"""Distances from the outline at which the pure spectra of object and chamber are taken, and those that the rim is
+compared with."""
 RIM_CHANGE = 0.025
-"""Largest change of the rim's median brightness, relative to deep pixels, with which the coverage can be told
+"""Largest change of the rim's median brightness relative to deep pixels with which the coverage is measured
 (docs/validation/surface.md)."""
 _SMOOTHING_PX = 1.0
 
@@ -48,7 +50,7 @@ _SMOOTHING_PX = 1.0
 def outline_opacity(run: TrainedRun, rays_per_batch: int) -> float:
     """The opacity of a run's rays through pixels that the object covers by half (`half_coverage_opacity`).
 
-    Pixels before the turntable are left out, because their background is lit by the object and turns with it.
+    Pixels in front of the turntable are left out: their background receives light from the object and turns with it.
 
     Args:
         run: the trained run.
@@ -83,7 +85,7 @@ def half_coverage_opacity(
 ) -> float:
     """Median opacity of the pixels that the object covers by `MEASURED_COVERAGE`.
 
-    `HALF` if there are too few such pixels, or if the rim is lit otherwise than the object's inside.
+    `HALF` if there are too few such pixels, or if the rim has another brightness than the object's inside.
 
     Args:
         sampler: has the masks and reads the spectra.
@@ -103,7 +105,7 @@ def half_coverage_opacity(
 
 
 def _some(pixels: tuple[Int[np.ndarray, "n 3"], ...]) -> list[Int[np.ndarray, "m 3"]]:
-    """At most `MOST_PIXELS` of them, evenly."""
+    """At most `MOST_PIXELS` of the pixels, evenly chosen."""
     return [part[:: max(1, -(-len(part) // MOST_PIXELS))] for part in pixels]
 
 
@@ -128,7 +130,7 @@ def outline_pixels(
         inside_px: depth of the pixels inside. Those outside are `PURE_PX` beside the mask.
 
     Returns:
-        Pixels (frame, line, sample): near the outline, on the object beside it, and on the chamber beside it.
+        Pixels (frame, line, sample) near the outline, on the object inside it, and on the chamber outside it.
     """
     found = [(np.zeros((0, 3), int),) * 3]
     for frame in range(0, len(masks), -(-len(masks) // MOST_FRAMES)):
@@ -139,8 +141,8 @@ def outline_pixels(
         depth_px = ndimage.distance_transform_edt(mask) - ndimage.distance_transform_edt(~mask)
         chamber = before_chamber(frame)
         on = np.argwhere((depth_px >= depths_px[0]) & (depth_px <= depths_px[1]) & chamber)
-        inwards = np.stack(np.gradient(ndimage.gaussian_filter(depth_px, _SMOOTHING_PX)), axis=-1)[tuple(on.T)]
-        inwards /= np.maximum(np.linalg.norm(inwards, axis=1, keepdims=True), 1e-9)
+        gradient = np.stack(np.gradient(ndimage.gaussian_filter(depth_px, _SMOOTHING_PX)), axis=-1)
+        inwards = unit_vectors(gradient[tuple(on.T)])
         of_on = depth_px[tuple(on.T)][:, None]
         inside, outside = (np.rint(on + (to_px - of_on) * inwards).astype(int) for to_px in (inside_px, -PURE_PX))
         within = [((places >= 0) & (places < mask.shape)).all(axis=1) for places in (inside, outside)]
@@ -164,13 +166,13 @@ def pixel_coverage(
         outside: pixels of the background, likewise.
 
     Returns:
-        About 0 to 1, with the noise of the spectra; NaN where the two spectra are too much alike.
+        About 0 to 1, with the noise of the spectra; NaN where the two spectra are too similar.
     """
     batches = [sampler.at(places) for places in (on, inside, outside)]
     mixed, covered, bare = (batch["spectral"].astype(np.float64) for batch in batches)
     valid = np.logical_and.reduce([batch.get("valid", np.ones(mixed.shape, bool)) for batch in batches])
     contrast = np.where(valid, covered - bare, 0.0)
     energy = (contrast**2).sum(axis=1)
-    tells = energy > LEAST_CONTRAST**2 * np.maximum(valid.sum(axis=1), 1)
+    differs = energy > LEAST_CONTRAST**2 * np.maximum(valid.sum(axis=1), 1)
     projected = ((mixed - bare) * contrast).sum(axis=1)
-    return np.divide(projected, energy, out=np.full(len(on), np.nan), where=tells)
+    return np.divide(projected, energy, out=np.full(len(on), np.nan), where=differs)

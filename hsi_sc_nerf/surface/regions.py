@@ -14,8 +14,8 @@ from torch.nn import functional
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import read_picture
-from hsi_sc_nerf.geometry.visual_hull import silhouette_counts
 from hsi_sc_nerf.packed.dataset import PackedFrame
+from hsi_sc_nerf.processing.visual_hull import silhouette_counts
 from hsi_sc_nerf.surface.depth_renders import DepthRenders
 
 MIN_MASK_FRACTION = 0.8

@@ -1,9 +1,9 @@
-"""Where the surface lies in a soft density: where the model's own silhouettes are.
+"""The surface in a soft density, defined by the model's own silhouettes.
 
-A trained density rises over a few millimetres, because a pixel at the outline sees the object in a part of its area.
-A mask ends where the object covers half of a pixel, and there the model has learned to render half of the object. So
-a ray that touches the true surface collects an opacity of one half. That names the surface without a threshold to
-tune: how opaque the density is there from the front depends on the curvature, the pixels and the training.
+A trained density rises over a few millimetres, because the object covers only a part of a pixel on its outline. A
+mask ends where the object covers half of a pixel, and there the model has learned to render half of the object. So a
+ray that touches the true surface collects an opacity of one half. This defines the surface without a threshold on the
+opacity of frontal rays, which depends on the curvature, the pixels and the training.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ REACH = 0.055
 5 mm to both sides; further away it meets other parts of the object."""
 RAY_SAMPLES = 12
 DIRECTIONS = 4
-"""Touching rays a point, evenly around the normal. The one that collects least counts: along the strongest curvature
-the ray is the shortest time in the density, and other parts of the object are the least in its way."""
+"""Touching rays through each point, evenly around the normal. The one with the least opacity counts: along the
+strongest curvature, the path through the density is shortest and meets other parts of the object least."""
 HOLLOW = 2.0
-"""A point is in a hollow if every such ray collects more than this multiple of what one along a plane collects."""
-FOLDING = (1e-3, 1e-2)
-"""Bounds of the depth over which the density grows by e (about 0.1 to 1 mm): outside of them it is no surface's."""
+"""A point is in a hollow if every such ray collects more than this multiple of the optical depth along a plane."""
+E_FOLDING_DEPTH = (1e-3, 1e-2)
+"""Bounds of the depth over which the density at a surface grows by the factor e (about 0.1 to 1 mm)."""
 MAX_STEPS = (0.014, 0.007, 0.0035, 0.0018)
-"""Most that the iterations move a point (about 1.5 to 0.2 mm): a hard edge is found by halving, a soft one sooner."""
+"""Largest steps of the iterations (about 1.5 to 0.2 mm): a hard edge is found by halving them, a soft one sooner."""
 SEARCH = (0.04, 0.06)
-"""Where no ray touches, the surface is searched from so far before a point to so far behind it."""
+"""In hollows, the surface is searched from this distance in front of a point to this distance behind it."""
 SEARCH_STEPS = 50
 USUAL_OPACITY = 0.05
-"""Opacity of a ray from the front at the surface, where no point of the object has a ray that touches it."""
+"""Opacity of a frontal ray at the surface, used if no point of the object has a touching ray."""
 _NORMAL_STEP = 0.002
 _LEAST_DENSITY = 1e-6
 
@@ -45,17 +45,17 @@ def move_to_silhouettes(
     normals: Float[Tensor, "n 3"],
     touching_opacity: float = 0.5,
 ) -> Float[Tensor, "n 3"]:
-    """Points near the surface, moved along their normals to where a touching ray collects its opacity.
+    """Points near the surface, moved along their normals to where a touching ray collects ``touching_opacity``.
 
-    Into the object, the density near its surface grows exponentially, and so does the optical depth of a touching
-    ray: steps of Newton's method in its logarithm are nearly exact. Nothing touches a hollow. The surface there is
-    where a ray from the front has collected what such rays collect to the surface elsewhere, in the median.
+    Towards the inside, the density near the surface grows exponentially, and so does the optical depth of a touching
+    ray. So steps of Newton's method in its logarithm are nearly exact. No ray touches a hollow. There, the surface is
+    where a frontal ray has collected the same opacity as frontal rays to the surface elsewhere, in the median.
 
     Args:
         density_fn: density of the model at points, per scene unit.
         points: within a millimetre or two of the surface, scene units.
         normals: outward unit vectors.
-        touching_opacity: opacity that a ray collects which touches the surface, in (0, 1).
+        touching_opacity: opacity of a ray that touches the surface, in (0, 1).
 
     Example:
         >>> moved = move_to_silhouettes(model.field.density_fn, vertices, vertex_normals)
@@ -66,8 +66,8 @@ def move_to_silhouettes(
         depth, touches = _least_touching_depth(density_fn, moved, tangents)
         touched &= touches
         rise = (_density(density_fn, moved - step) / _density(density_fn, moved + step)).log()
-        folding = (2.0 * _NORMAL_STEP / rise.clamp_min(1e-6)).clamp(*FOLDING)
-        inwards = folding * (-math.log1p(-touching_opacity) / depth).log()
+        e_folding = (2.0 * _NORMAL_STEP / rise.clamp_min(1e-6)).clamp(*E_FOLDING_DEPTH)
+        inwards = e_folding * (-math.log1p(-touching_opacity) / depth).log()
         moved = moved - inwards.clamp(-max_step, max_step)[:, None] * normals
     if touched.all():
         return moved
@@ -89,9 +89,9 @@ def _least_touching_depth(
     points: Float[Tensor, "n 3"],
     tangents: tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]],
 ) -> tuple[Float[Tensor, "n"], Bool[Tensor, "n"]]:
-    """Optical depth of the ray through each point, across its normal, that collects least; whether that one touches.
+    """Least optical depth of rays through each point perpendicular to its normal, and whether that ray touches.
 
-    A ray in a hollow does not touch: it goes deeper into the density to both sides.
+    A ray in a hollow does not touch: on both sides it goes deeper into the density.
     """
     first, second = tangents
     step = 2.0 * REACH / RAY_SAMPLES
@@ -110,8 +110,8 @@ def _density(density_fn: Callable[[Tensor], Tensor], points: Float[Tensor, "*n 3
 
 
 def _tangents(normals: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Two unit vectors across each normal and each other."""
-    # The axis that the normal has least of is never along it.
+    """Two unit vectors perpendicular to each normal and to each other."""
+    # The axis of the normal's smallest component is never parallel to it.
     axis = torch.nn.functional.one_hot(normals.abs().argmin(dim=-1), 3).to(normals)
     first = torch.nn.functional.normalize(torch.linalg.cross(normals, axis), dim=-1)
     return first, torch.linalg.cross(normals, first)

@@ -22,8 +22,8 @@ from hsi_sc_nerf.numerics import safe_ratio
 MIN_OPACITY = 0.5
 """Rays that collect less opacity than this hit no surface (released settings of the paper)."""
 SURFACE_OPACITY = 0.07
-"""Opacity that a ray along the surface's normal has collected about at the surface. The vertices of a cloud's mesh
-are then moved to the model's silhouettes (`silhouette_surface`)."""
+"""Approximate opacity of a ray along the normal at the surface. The vertices of a cloud's mesh are afterwards moved
+to the model's silhouettes (`silhouette_surface`)."""
 INTERIOR_OPACITY = 0.25
 """Opacity at which the density gradient is read. Further out the gradient is noise."""
 SEARCH_DEPTH = 0.1
@@ -128,7 +128,7 @@ def render_object(model: SpectralModel, rays: RayBundle) -> tuple[dict[str, Tens
 
 @torch.no_grad()
 def rendered_density(model: SpectralModel, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 1"]:
-    """Density at points as it is rendered: 0 where the occupancy grid knows no matter."""
+    """Density at points as it is rendered: 0 where the occupancy grid is empty."""
     return model.field.density_fn(points) * _may_hold_matter(model, points)[..., None]
 
 
@@ -139,9 +139,9 @@ def densities_along(
     directions: Float[Tensor, "rays 3"],
     edges: Float[Tensor, "rays steps_and_1"],
 ) -> Float[Tensor, "rays steps"]:
-    """Density in the middle of each step; 0 where the occupancy grid knows no matter, which is never rendered.
+    """Density in the middle of each step; 0 where the occupancy grid is empty, which is never rendered.
 
-    Without a GPU, it is 0 as well behind an optical depth of ``OPAQUE``.
+    Without a GPU, it is also 0 behind an optical depth of ``OPAQUE``.
 
     Args:
         model: trained model, in evaluation mode.
@@ -168,7 +168,7 @@ def densities_along(
 
 
 def _may_hold_matter(model: SpectralModel, points: Float[Tensor, "*n 3"]) -> Bool[Tensor, "*n"]:
-    """Whether the occupancy grid knows matter at points; everywhere, where there is none."""
+    """Whether the occupancy grid may hold matter at points; true everywhere without a grid."""
     grid = model.occupancy
     if grid is None:
         return torch.ones_like(points[..., 0], dtype=torch.bool)

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.spatial import sample_surface
+from hsi_sc_nerf.geometry.camera import unit_vectors
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.surface.depth_renders import DepthRenders
@@ -45,7 +46,7 @@ than the part of the surface that a cell of the depth maps covers either."""
 TRUNCATION_VOXELS = 4
 """Signed distances are truncated at this many voxels from the surface."""
 NORMAL_VERTICES = 8
-"""Normals are means over this many vertices: those of one vertex are as rough as the voxels."""
+"""Number of vertices over which normals are averaged: the normal of one vertex is as rough as the voxels."""
 
 
 @dataclass(eq=False)
@@ -181,7 +182,7 @@ def surface_mesh(
     points_per_batch: int,
     touching_opacity: float = 0.5,
 ) -> SurfaceMesh | None:
-    """The fused mesh with its vertices moved to the model's silhouettes, without triangles that are no surface of it.
+    """The fused mesh with its vertices moved to the model's silhouettes, without triangles off the model's surface.
 
     Args:
         model: trained model, in evaluation mode.
@@ -201,7 +202,7 @@ def surface_mesh(
     floor = float(box[0][2])
 
     def density_fn(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 1"]:
-        # Rays that touch the object's base would end in what it stands on.
+        # Rays that touch the object's base would end in its support.
         return rendered_density(model, points) * (points[..., 2:] >= floor)
 
     with progress_bar("finding the surface", "points", len(vertices)) as update:
@@ -225,8 +226,7 @@ class SurfaceMesh(Mesh):
         """Outward unit normals: area-weighted mean over the ``NORMAL_VERTICES`` nearest vertices."""
         tree, vertex_normals = self._search
         _, nearest = tree.query(points, k=min(NORMAL_VERTICES, len(self.vertices)))
-        normals = vertex_normals[nearest.reshape(len(points), -1)].sum(axis=1)
-        return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+        return unit_vectors(vertex_normals[nearest.reshape(len(points), -1)].sum(axis=1))
 
     def triangles_in(self, box: Float[np.ndarray, "2 3"]) -> Int[np.ndarray, "near 3"]:
         """Triangles with an area whose bounding boxes touch a box."""

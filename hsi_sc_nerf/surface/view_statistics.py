@@ -1,4 +1,4 @@
-"""What the frames that see a point measured of it: their number, how much they differ, how many are saturated."""
+"""Statistics over the frames that see a point: their number, the spread of their spectra, the saturated fraction."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from capture_factory import BANDS, DARK, LAMP, SIZE_PX, WAVELENGTHS_NM, write_session
 
-from hsi_sc_nerf.calibration.dark_checks import check_dark, light_over_white
+from hsi_sc_nerf.calibration.reference_checks import check_dark, light_over_white
 from hsi_sc_nerf.capture.envi import open_cube, write_cube
 from hsi_sc_nerf.capture.session import open_session
 

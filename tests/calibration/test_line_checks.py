@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hsi_sc_nerf.calibration.detector import light_of_some_lines
-from hsi_sc_nerf.calibration.line_checks import bright_pixels, check_lines, line_heights
+from hsi_sc_nerf.calibration.reference_checks import bright_pixels, check_lines, line_heights
 from hsi_sc_nerf.capture.envi import open_cube, write_cube
 from hsi_sc_nerf.capture.session import open_session
 

@@ -12,7 +12,7 @@ import pytest
 from hsi_sc_nerf.export.cloud import read_spectral_ply
 from hsi_sc_nerf.packed.cube import REFLECTANCE_SCALE
 from hsi_sc_nerf.packed.dataset import open_packed
-from hsi_sc_nerf.simulate.processing_score import score_processing
+from hsi_sc_nerf.simulate.scores import score_processing
 from hsi_sc_nerf.simulate.truth import load_truth
 
 pytestmark = pytest.mark.slow

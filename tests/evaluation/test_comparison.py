@@ -14,7 +14,7 @@ from hsi_sc_nerf.evaluation.comparison_report import write_comparison
 from hsi_sc_nerf.evaluation.registration import Registration, Rival
 from hsi_sc_nerf.evaluation.spatial import sample_surface, score_at
 from hsi_sc_nerf.geometry.camera import Similarity
-from hsi_sc_nerf.simulate.true_surface import seen_points, true_reference
+from hsi_sc_nerf.simulate.scores import seen_points, true_reference
 from hsi_sc_nerf.simulate.truth import load_truth
 
 RADIUS_M, CAMERA_M = 0.04, 0.2

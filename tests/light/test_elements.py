@@ -7,7 +7,7 @@ import trimesh
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.light.elements import MISPLACED_PX, Elements, observe, shown_points, spread_elements, support_mesh
-from hsi_sc_nerf.light.standing_light import even_directions
+from hsi_sc_nerf.light.stationary_light import even_directions
 from hsi_sc_nerf.light.views import Transfer, transfer
 
 RADIUS_M = 0.03

@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hsi_sc_nerf.processing.appearance_checks import SLIPS_DEG, check_appearance, slip_between, without_standing_light
+from hsi_sc_nerf.processing.appearance_checks import (
+    SLIPS_DEG,
+    check_appearance,
+    slip_between,
+    without_stationary_light,
+)
 from hsi_sc_nerf.processing.view_changes import PointViews
 
 FRAMES, POINTS, COLOURS = 24, 2500, 4
@@ -117,6 +122,6 @@ def test_what_stands_still_on_a_smooth_object_is_no_slip():
 def test_the_slip_between_two_frames_is_measured(slip_deg):
     views = ball(slips_deg=np.where(np.arange(FRAMES) < 10, 0.0, slip_deg), noise=0.01)
     first, second = (np.flatnonzero(views.frame == number) for number in (9, 10))
-    found_deg, left = slip_between(views, without_standing_light(views) / 0.1, first, second)
+    found_deg, left = slip_between(views, without_stationary_light(views) / 0.1, first, second)
     assert found_deg == pytest.approx(slip_deg, abs=np.diff(SLIPS_DEG)[0])
     assert left == 1.0 if slip_deg == 0.0 else left < 0.6

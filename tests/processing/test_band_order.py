@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hsi_sc_nerf.capture.envi import open_cube
-from hsi_sc_nerf.processing.band_order import check_band_order
+from hsi_sc_nerf.processing.appearance_checks import check_band_order
 from hsi_sc_nerf.simulate.materials import MATERIALS, endmembers
 
 NM = np.linspace(397.0, 1003.0, 204)

@@ -8,7 +8,7 @@ from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.packed.dataset import Container
 from hsi_sc_nerf.processing.mask_checks import check_masks
 from hsi_sc_nerf.processing.masks import above_lid, lid_middle
-from hsi_sc_nerf.processing.voted_hull import voted_hull
+from hsi_sc_nerf.processing.visual_hull import voted_hull
 
 INTRINSICS = PinholeIntrinsics(64, 64, 120.0, 120.0, 32.0, 32.0)
 CONTAINER = Container(diameter_m=0.09, height_m=0.07)

@@ -57,7 +57,7 @@ def test_pieces_of_an_object_are_masked_together_and_others_are_told():
 def test_no_contrast():
     rng = np.random.default_rng(4)
     for scores in (np.abs(rng.normal(0.0, 0.01, (30, 30))), np.zeros((30, 30))):
-        with pytest.raises(InputError, match="no object can be told from the background"):
+        with pytest.raises(InputError, match="no object stands out from the background"):
             select_threshold([scores])
         assert select_threshold([scores], 0.2) == 0.2
 

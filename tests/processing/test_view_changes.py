@@ -18,7 +18,7 @@ from hsi_sc_nerf.processing.view_changes import (
     colours_of,
     point_views,
 )
-from hsi_sc_nerf.processing.voted_hull import voted_hull
+from hsi_sc_nerf.processing.visual_hull import voted_hull
 
 FRAMES, CHANNELS = 24, 3
 NOISE = 0.02

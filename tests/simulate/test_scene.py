@@ -161,7 +161,7 @@ def test_overrides_are_checked_as_well(wrong):
     [
         ("side_m: 0.036", "side_m: 0.06", "do not fit around the container"),
         ("disc_diameter_m: 0.205", "disc_diameter_m: 0.15", "do not fit on the disc"),
-        ("side_m: 0.036", "side_m: 0.036, dictionary: DICT_9X9", "not an ArUco dictionary"),
+        ("side_m: 0.036", "side_m: 0.036, dictionary: DICT_9X9", "is not one of OpenCV"),
         ("side_m: 0.036", "side_m: 0.004, on_disc: 50, on_container: 6", "has only 50 markers"),
     ],
 )

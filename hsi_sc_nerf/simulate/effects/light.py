@@ -11,6 +11,7 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float
 
+from hsi_sc_nerf.geometry.camera import unit_vectors
 from hsi_sc_nerf.settings_file import between
 from hsi_sc_nerf.simulate.effect import Effect
 from hsi_sc_nerf.simulate.light import HitLight, Reflection, SurfaceLight, SurfaceLightEffect, ViewLightEffect
@@ -155,8 +156,7 @@ class Gloss(ViewLightEffect):
 
         Shadowing is Smith's, the reflectance of each facet Schlick's.
         """
-        half = to_camera + to_lamp
-        half = half / np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-12)
+        half = unit_vectors(to_camera + to_lamp)
         to_camera_cosine = np.maximum(np.einsum("nk,nk->n", normals, to_camera), 1e-6)
         to_lamp_cosine = np.maximum((normals * to_lamp).sum(axis=-1), 1e-6)
         half_cosine = np.einsum("nk,nk->n", normals, half)

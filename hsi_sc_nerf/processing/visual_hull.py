@@ -1,22 +1,36 @@
-"""The visual hull of the masks, found by vote on a coarse grid, what each camera sees of it, and boxes about it."""
+"""The visual hull of the foreground masks, what each camera sees of it, and boxes about it.
+
+The visual hull is the set of points that project into the object's mask in every frame (A. Laurentini, "The visual
+hull concept for silhouette-based image understanding", IEEE TPAMI 16, 1994). `voted_hull` computes it on a coarse
+grid and lets a few frames contradict a point.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, closest_point_to_rays, image_of
-from hsi_sc_nerf.geometry.visual_hull import visual_hull
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, closest_point_to_rays, image_of, pixels_of
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.packed.dataset import Container
 
+MIN_VIEWS_FRACTION = 2.0 / 3.0
+"""A point of the hull lies in the image of this fraction of the frames: too few masks carve what lies far behind the
+object or beside the camera."""
+MAX_MISSED_FRACTION = 0.05
+"""A point of the hull may lie outside the mask in this fraction of all frames: one wrong mask or pose must not cut a
+piece off the object."""
+_FIRST_STEP = 6
+"""Every sixth frame is tested first: a few frames rule out most points."""
 GRID_CELLS = 48
 """The visual hull is computed on this number of voxels along each axis."""
 HULL_MISSED_FRACTION = 0.15
-"""Frames that may contradict a point of the hull: a few frames of another object must not carve it."""
+"""Fraction of the frames that may contradict a point: a few frames of another object must not carve the hull."""
 OBJECT_MARGIN_M = 0.003
 """The object's box is widened by this: masks and poses are uncertain by a pixel or two."""
 SCENE_MARGIN_M = 0.005
@@ -33,7 +47,7 @@ class VotedHull:
     """The visual hull that most masks agree on.
 
     Attributes:
-        core: centres of the voxels that hardly any mask contradicts (`visual_hull.MAX_MISSED_FRACTION`), object
+        core: centres of the voxels that hardly any mask contradicts (`MAX_MISSED_FRACTION`), object
             frame, metres; n may be 0.
         sides_m: of a voxel.
         voxel_px: diameter of a voxel in the images, odd.
@@ -104,6 +118,60 @@ def _silhouette(
     return ~dilate(~dilate(image_of(voxels, pose, intrinsics), voxel_px), 2 * voxel_px - 1)
 
 
+def visual_hull(
+    points: Float[np.ndarray, "n 3"],
+    masks: Bool[np.ndarray, "frames h w"],
+    camera_to_worlds: Float[np.ndarray, "frames 4 4"],
+    intrinsics: PinholeIntrinsics,
+    max_missed_fraction: float = MAX_MISSED_FRACTION,
+) -> Float[np.ndarray, "kept 3"]:
+    """The points that most frames see (`MIN_VIEWS_FRACTION`) and few outside the mask.
+
+    Lens distortion is neglected.
+
+    Args:
+        points: in the object frame, metres.
+        masks: true on the object.
+        camera_to_worlds: poses, OpenGL axes.
+        max_missed_fraction: fraction of all frames that may have a point of the hull outside of their mask.
+
+    Example:
+        >>> ticks = np.linspace(-0.1, 0.1, 48)
+        >>> centres = np.stack(np.meshgrid(ticks, ticks, ticks), axis=-1).reshape(-1, 3)
+        >>> hull = visual_hull(centres, masks, camera_to_worlds, intrinsics)
+    """
+    max_missed = int(max_missed_fraction * len(masks) + 1e-9)
+    for step in (_FIRST_STEP, 1):
+
+        def pixels_in(frame: int, points: Float[np.ndarray, "n 3"], step: int = step) -> tuple[Any, Any]:
+            return pixels_of(points, camera_to_worlds[frame * step], intrinsics)
+
+        in_image, in_mask = silhouette_counts(points, masks[::step], pixels_in)
+        keep = in_image - in_mask <= max_missed
+        points, in_image = points[keep], in_image[keep]
+    return points[in_image >= MIN_VIEWS_FRACTION * len(masks) - 1e-9]
+
+
+def silhouette_counts(points: Any, masks: Iterable[Any], pixels_of: Callable[[int, Any], Any]) -> tuple[Any, Any]:
+    """Count the frames that have each point in their image, and those that have it in the object's mask.
+
+    Occlusion is ignored. Takes NumPy arrays or tensors and returns two counts (n) of the same kind.
+
+    Args:
+        points: (n, 3), in the unit that ``pixels_of`` takes.
+        masks: of each frame (lines, samples), true on the object.
+        pixels_of: of a frame's index and points, which points lie in the image (n), and their pixels (n, 2) as
+            (sample, line), (0, 0) where they do not.
+    """
+    in_image: Any = 0
+    in_mask: Any = 0
+    for index, mask in enumerate(masks):
+        inside, pixels = pixels_of(index, points)
+        in_image = in_image + inside
+        in_mask = in_mask + (inside & mask[pixels[:, 1], pixels[:, 0]])
+    return in_image, in_mask
+
+
 def object_box(hull: VotedHull, min_z_m: float | None = None) -> Float[np.ndarray, "2 3"]:
     """Minimum and maximum of the core of the masks' visual hull, object frame, metres.
 
@@ -162,13 +230,13 @@ def scene_box(
 
 
 def assumed_disc(has_markers: bool, container_diameter_m: float | None) -> str | None:
-    """What `scene_box` assumes of a disc that no marker shows, as the rest of a sentence; None with markers."""
+    """What `scene_box` assumes about a disc that no marker shows, as the rest of a sentence; None with markers."""
     if has_markers:
         return None
     if container_diameter_m is None:
-        return "nothing shows how far the disc reaches: what turns is taken to end where the masks' hull ends"
+        return "the size of the disc is not known: the scene is taken to end where the masks' hull ends"
     diameter_mm = 1e3 * DISC_OVER_CONTAINER * container_diameter_m
     return (
-        f"no marker shows how far the disc reaches: its diameter is taken to be {diameter_mm:.0f} mm, "
+        f"no marker shows the size of the disc: its diameter is taken to be {diameter_mm:.0f} mm, "
         f"{DISC_OVER_CONTAINER} times the container's"
     )

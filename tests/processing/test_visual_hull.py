@@ -7,7 +7,7 @@ from capture_factory import INTRINSICS, SPHERE_CENTRE_M, SPHERE_RADIUS_M, sphere
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, project, turntable_camera_to_world
 from hsi_sc_nerf.packed.dataset import Container
-from hsi_sc_nerf.processing.voted_hull import (
+from hsi_sc_nerf.processing.visual_hull import (
     DISC_OVER_CONTAINER,
     DISC_OVER_MARKERS,
     OBJECT_MARGIN_M,

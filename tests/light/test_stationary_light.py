@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hsi_sc_nerf.light.standing_light import (
+from hsi_sc_nerf.light.stationary_light import (
     LOBE_WIDTH_RAD,
     even_directions,
     harmonic_degrees,

@@ -7,7 +7,7 @@ import pytest
 
 from hsi_sc_nerf.packed.cube import pack, unpack, write_packed_cube
 from hsi_sc_nerf.packed.dataset import open_packed
-from hsi_sc_nerf.simulate.processing_score import score_processing
+from hsi_sc_nerf.simulate.scores import score_processing
 from hsi_sc_nerf.simulate.truth import load_truth
 
 

@@ -1,4 +1,4 @@
-"""Light that stands still in the camera's frame: an uneven chamber and lamps, as functions of direction.
+"""Light that is stationary in the camera's frame: an uneven chamber and lamps, as functions of direction.
 
     radiance(direction, band) = chamber(direction) * chamber_colour(band) + lamps(direction) * lamp_colour(band)
 
@@ -14,17 +14,19 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import sph_harm_y
 
+from hsi_sc_nerf.geometry.camera import unit_vectors
+
 DEGREE = 2
 """Largest degree of the chamber's harmonics: irradiance hardly shows higher ones (Ramamoorthi and Hanrahan 2001)."""
 TERMS = (DEGREE + 1) ** 2
 FINE_DIRECTIONS = 1 << 13
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 LOBE_WIDTH_RAD = 0.08
-"""Standard deviation of a lobe: that of a lamp of 25 cm at 1 m, and no lobe falls between the directions of rays."""
+"""Standard deviation of a lobe: that of a lamp of 25 cm at 1 m, and wide enough for the directions of the rays."""
 
 
 @dataclass(frozen=True, eq=False)
-class StandingLight:
+class StationaryLight:
     """The light of a session.
 
     Attributes:
@@ -45,16 +47,16 @@ class StandingLight:
 
     def on(self, normal: Float[np.ndarray, "3"]) -> tuple[float, float]:
         """Irradiance by chamber and lamps, without their colours, on an unoccluded surface at the centre."""
-        of_chamber, of_lamps = units_on(normal, self.to_lamps)
+        of_chamber, of_lamps = unit_irradiance(normal, self.to_lamps)
         return float(of_chamber @ self.chamber), float(of_lamps @ self.lamps)
 
 
-def even_light(bands: int) -> StandingLight:
+def even_light(bands: int) -> StationaryLight:
     """The light of an even chamber without lamps."""
-    return StandingLight(np.eye(TERMS)[0], np.zeros(0), np.zeros((0, 3)), 0.0, np.ones(bands), np.ones(bands))
+    return StationaryLight(np.eye(TERMS)[0], np.zeros(0), np.zeros((0, 3)), 0.0, np.ones(bands), np.ones(bands))
 
 
-def units_on(
+def unit_irradiance(
     normal: Float[np.ndarray, "3"], to_lamps: Float[np.ndarray, "lamps 3"]
 ) -> tuple[Float[np.ndarray, "terms"], Float[np.ndarray, "lamps"]]:
     """Irradiance of each harmonic and of each lamp of strength 1 on an unoccluded surface at the centre."""
@@ -106,6 +108,5 @@ def lobes(
 def tangents(towards: Float[np.ndarray, "lamps 3"]) -> Float[np.ndarray, "lamps 2 3"]:
     """Two unit vectors perpendicular to each other and to each of the given ones."""
     helper = np.eye(3)[np.abs(towards).argmin(axis=1)]
-    first = np.cross(towards, helper)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    first = unit_vectors(np.cross(towards, helper))
     return np.stack([first, np.cross(towards, first)], axis=1)

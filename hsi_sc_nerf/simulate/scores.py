@@ -1,26 +1,88 @@
-"""The true surface of a simulated object as the reference of comparisons, and what the views see of it."""
+"""Results of a simulated session against its truth: a processed dataset, and the surface of the object."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.comparison import CompareConfig, Reference, Track, surface_of, without_progress
-from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL
-from hsi_sc_nerf.geometry.mesh import ray_scene
+from hsi_sc_nerf.geometry.camera import project, project_distorted, rotation_angle_deg, unit_vectors
+from hsi_sc_nerf.geometry.mesh import ray_scene, unoccluded
+from hsi_sc_nerf.packed.cube import unpack
+from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.simulate.truth import COVERED, Truth, load_truth
+from hsi_sc_nerf.spectra import nearest_bands
 
 if TYPE_CHECKING:
     from open3d.t.geometry import RaycastingScene
 
 LIFT_M = 1e-5
 """Offset of the origin of a line of sight from the surface."""
+
+
+@dataclass(frozen=True)
+class ProcessingScore:
+    """Errors of a packed dataset over its frames.
+
+    Attributes:
+        rotation_deg: largest angle between an estimated and a true camera orientation.
+        position_m: largest distance between an estimated and a true camera position.
+        focal_length_percent: error of the focal length.
+        reflectance_rmse: root mean squared error over all valid values, noise included; NaN without valid values.
+        flagged_fraction: fraction of invalid values, in [0, 1].
+        mask_iou: smallest intersection over union of a mask with the true object pixels.
+    """
+
+    rotation_deg: float
+    position_m: float
+    focal_length_percent: float
+    reflectance_rmse: float
+    flagged_fraction: float
+    mask_iou: float
+
+
+def score_processing(dataset: PackedDataset, truth: Truth) -> ProcessingScore:
+    """Compare a packed dataset with the truth of its session, frame by frame and without alignment.
+
+    Args:
+        dataset: processed session.
+        truth: truth of the session, in all bands of the dataset; it is clipped as reflectance is by default.
+
+    Example:
+        >>> score = score_processing(open_packed("data"), load_truth("pear-session"))
+        >>> score.rotation_deg < 0.5
+        True
+    """
+    poses = dict(zip(truth.captures, truth.camera_to_world, strict=True))
+    bands = nearest_bands(truth.wavelengths_nm, dataset.wavelengths_nm)
+    rotations, positions, ious = [], [], []
+    squares, measurements, values = 0.0, 0, 0
+    for frame in dataset.frames:
+        pose = poses[frame.capture]
+        rotations.append(float(rotation_angle_deg(frame.camera_to_world, pose)))
+        positions.append(float(np.linalg.norm(frame.camera_to_world[:3, 3] - pose[:3, 3])))
+        measured, valid = unpack(frame.cube())
+        errors = np.clip(truth.reflectance(frame.capture)[..., bands], *paper.REFLECTANCE_BOUNDS) - measured
+        squares += float(np.sum(errors**2, where=valid, dtype=float))
+        measurements += int(valid.sum())
+        values += valid.size
+        mask, covered = frame.mask(), truth.object_coverage(frame.capture) > COVERED
+        ious.append(float((mask & covered).sum() / (mask | covered).sum()))
+    return ProcessingScore(
+        rotation_deg=max(rotations),
+        position_m=max(positions),
+        focal_length_percent=100 * abs(dataset.intrinsics.fl_x / truth.intrinsics.fl_x - 1),
+        reflectance_rmse=float(np.sqrt(squares / measurements)) if measurements else np.nan,
+        flagged_fraction=1.0 - measurements / values,
+        mask_iou=min(ious),
+    )
 
 
 def true_reference(session_dir: Path, config: CompareConfig, track: Track = without_progress) -> Reference:
@@ -83,21 +145,18 @@ def seen_points(
         candidates = candidates[_in_object_pixels(truth, capture, poses[capture], points_m[candidates])]
         if not len(candidates):
             continue
-        seen[candidates] = unoccluded(scene, points_m[candidates], poses[capture][:3, 3])
+        seen[candidates] = visible_from(scene, points_m[candidates], poses[capture][:3, 3])
     return seen
 
 
-def unoccluded(
+def visible_from(
     scene: RaycastingScene,
     points_m: Float[np.ndarray, "n 3"],
     eye_m: Float[np.ndarray, "3"],
     lift_m: float = LIFT_M,
 ) -> Bool[np.ndarray, "n"]:
     """Whether each point of a surface is visible from ``eye_m``; occluders within ``lift_m`` of it do not count."""
-    sight = eye_m - points_m
-    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
-    rays = np.concatenate([points_m, sight], axis=1, dtype=np.float32)
-    return ~scene.test_occlusions(rays, tnear=lift_m).numpy()
+    return unoccluded(scene, points_m, unit_vectors(eye_m - points_m), lift_m)
 
 
 def _in_object_pixels(
@@ -106,13 +165,10 @@ def _in_object_pixels(
     coverage = truth.object_coverage(capture)
     if not len(points_m):
         return np.zeros(0, bool)
-    world_to_camera = np.linalg.inv(camera_to_world @ OPENCV_TO_OPENGL)
-    in_camera = points_m @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
-    pixels, _ = cv2.projectPoints(
-        in_camera, np.zeros(3), np.zeros(3), truth.intrinsics.matrix(), np.array(truth.distortion)
-    )
-    columns, lines = np.floor(pixels[:, 0]).astype(int).T
-    inside = (in_camera[:, 2] > 0) & (lines >= 0) & (lines < coverage.shape[0])
+    depth = project(points_m, camera_to_world, truth.intrinsics)[1]
+    pixels = project_distorted(points_m, camera_to_world, truth.intrinsics, np.array(truth.distortion))
+    columns, lines = np.floor(pixels).astype(int).T
+    inside = (depth > 0) & (lines >= 0) & (lines < coverage.shape[0])
     inside &= (columns >= 0) & (columns < coverage.shape[1])
     shown = np.zeros(len(points_m), bool)
     shown[inside] = coverage[lines[inside], columns[inside]] >= COVERED

@@ -1,7 +1,10 @@
-"""Can the dark references be believed? As one finding.
+"""Are the dark references free of light, and did the same lamps shine on the white and on the frames? As findings.
 
-What a dark cube shows beyond its level is subtracted from the frames, band by band, so that reflectance is too low by
-as much. Light in it has the spectrum of the light on the white.
+A dark cube is subtracted from the frames band by band, so light in it lowers the reflectance by as much. Such light
+has the spectrum of the light on the white.
+
+Discharge lamps and screens emit narrow lines, and materials have none. A line that all pixels of the frames show
+relative to the white comes from a lamp that was on for one of the two only.
 """
 
 from __future__ import annotations
@@ -12,20 +15,31 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
+from scipy.ndimage import median_filter
 
-from hsi_sc_nerf.calibration.detector import some_lines, unlit_bands
+from hsi_sc_nerf.calibration.detector import light_of_some_lines, some_lines, unlit_bands
 from hsi_sc_nerf.calibration.white_source import WhiteSource, checked_source, white_cubes
 from hsi_sc_nerf.capture.envi import Cube
 from hsi_sc_nerf.capture.session import Session
-from hsi_sc_nerf.findings import Finding, leave_out, names_in_short
+from hsi_sc_nerf.findings import Finding, judged, leave_out, names_in_short
 
 LIT_AMBER, LIT_RED = 0.002, 0.01
-"""Light in a dark cube over that on the white, which is the reflectance that it takes away. Of a covered lens, dark
-patterns and noise leave less than 0.0001."""
+"""Light in a dark cube relative to the light on the white; reflectance is too low by this. It is below 0.0001 with a
+covered lens."""
 CERTAINTY = 3.0
-"""Standard deviations from which light counts: with few bands, a dark pattern may resemble a lamp."""
-OTHER_TIME = 1.01
-"""Factor between integration times from which they differ."""
+"""Light is reported from this many standard deviations: with few bands, a dark pattern may resemble a lamp."""
+DIFFERENT_TIME = 1.01
+"""Integration times differ if their ratio exceeds this."""
+LINE_AMBER, LINE_RED = 0.03, 0.1
+"""Height of a line over the reflectance beside it, as a fraction. Good sessions have less than 0.005."""
+WINDOW_NM, LARGEST_STEP_NM, FEWEST_BANDS = 45.0, 6.0, 40
+"""Width of the median filter, more than twice that of a line; largest step between bands and smallest number of bands
+with which lines can be detected."""
+LEAST_WHITE = 0.1
+"""Bands in which the white is darker than this fraction of its brightest band are not used: a spectrometer's stray
+light matters there, and it differs between materials."""
+FRAMES, BRIGHT, PIXELS = 8, 0.3, 250
+"""Number of compared frames; pixels above this fraction of the brightest are used; about this many of a frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,11 +53,11 @@ class _Exposure:
 
     @property
     def other_time(self) -> bool:
-        """Whether the two were exposed for different times, as far as the headers tell."""
+        """Whether the headers state different integration times for the two."""
         dark_ms = None if self.dark is None else self.dark.integration_time_ms
         if dark_ms is None or self.counts_ms is None:
             return False
-        return max(dark_ms, self.counts_ms) > OTHER_TIME * min(dark_ms, self.counts_ms)
+        return max(dark_ms, self.counts_ms) > DIFFERENT_TIME * min(dark_ms, self.counts_ms)
 
 
 def check_dark(
@@ -51,12 +65,12 @@ def check_dark(
     source: Literal["auto"] | WhiteSource = "auto",
     spectra: Mapping[str, Float[np.ndarray, "bands"] | None] | None = None,
 ) -> Finding:
-    """The finding ``dark``: whether all counts have a dark reference, of their own exposure, without light.
+    """The finding ``dark``: whether every capture has a dark reference of its integration time, without light.
 
     Args:
         session: its captures.
         source: where the white is.
-        spectra: mean counts of captures' dark references that were read before, by name.
+        spectra: mean counts of dark references that were already read, by the name of their capture.
 
     Raises:
         InputError: the session does not have that source of white.
@@ -74,7 +88,7 @@ def check_dark(
     if without:
         sentence = (
             f"{session.path}: {names_in_short(without)} {'has' if len(without) == 1 else 'have'} no dark reference, "
-            "unlike the other captures, so that the detector's offset would count as light; copy it there"
+            "unlike the other captures, so the detector's offset would be taken for light; copy it there"
         )
         frames = [frame.name for frame in session.frames if frame.name in without]
         advice = f" or leave out with {leave_out(frames)}" if 0 < len(frames) < len(session.frames) else ""
@@ -101,7 +115,7 @@ def check_dark(
     if other:
         sentence = (
             f"{session.path}: by their headers the dark references of {names_in_short(other)} have another "
-            "integration time than the captures; dark counts grow with it, so take them alike."
+            "integration time than the captures; dark counts grow with it, so take both with the same time."
         )
         return Finding("dark", "amber", sentence, values | {"other_integration_time": other})
     return Finding("dark", "green", "Dark references: every capture has one, without light.", values)
@@ -137,7 +151,7 @@ def light_over_white(dark: Float[np.ndarray, "bands"], white: Float[np.ndarray, 
 
 
 def _without_any(session: Session, exposures: Sequence[_Exposure]) -> Finding:
-    """No capture has a dark: right for counts whose offset is gone, which then reach zero."""
+    """No capture has a dark reference. This is right if the counts reach zero, because their offset was removed."""
     some = [some_lines(exposure.counts) for exposure in exposures]
     lowest = min(float(np.percentile(counts, 0.1)) for counts in some)
     brightest = max(float(counts.max()) for counts in some)
@@ -145,7 +159,66 @@ def _without_any(session: Session, exposures: Sequence[_Exposure]) -> Finding:
     if lowest <= LIT_AMBER * brightest:
         return Finding("dark", "green", "No capture has a dark reference, and the counts reach zero.", values)
     sentence = (
-        f"{session.path}: no capture has a dark reference, and hardly a count is below {lowest:.4g}, which may be "
+        f"{session.path}: no capture has a dark reference, and hardly any count is below {lowest:.4g}, which may be "
         "the detector's offset; take a dark reference with a covered lens."
     )
     return Finding("dark", "amber", sentence, values)
+
+
+def check_lines(
+    session: Session,
+    frames: Sequence[Float[np.ndarray, "pixels bands"]],
+    source: Literal["auto"] | WhiteSource = "auto",
+) -> list[Finding]:
+    """The finding ``light-lines``, for sessions with narrow bands and a white of their own.
+
+    Args:
+        session: its captures.
+        frames: counts above dark of brighter pixels of each frame (`bright_pixels`).
+        source: where the white is.
+
+    Raises:
+        InputError: the session does not have that source of white.
+    """
+    found = checked_source(session, source)
+    wavelengths_nm = session.wavelengths_nm
+    steps_nm = np.abs(np.diff(wavelengths_nm))
+    if found == "product" or len(wavelengths_nm) < FEWEST_BANDS or np.median(steps_nm) > LARGEST_STEP_NM:
+        return []
+    cube, dark = white_cubes(session, found)
+    white = bright_pixels(light_of_some_lines(cube, dark)).mean(axis=0)
+    lit = (white >= LEAST_WHITE * white.max()) & cube.good_bands
+    if np.count_nonzero(lit) < FEWEST_BANDS:
+        return []
+    chosen = np.unique(np.linspace(0, len(session.frames) - 1, FRAMES).astype(int)).tolist()
+    spectra = [frames[number][:, lit] / white[lit] for number in chosen]
+    window = 2 * round(WINDOW_NM / 2.0 / float(np.median(steps_nm))) + 1
+    height = line_heights(np.concatenate(spectra), window)
+    worst = int(np.abs(height).argmax())
+    text = (
+        f"at {wavelengths_nm[lit][worst]:.0f} nm the reflectance of all frames differs by "
+        f"{100.0 * abs(height[worst]):.2g} % from that in the neighbouring bands"
+    )
+    lit_alone = "the frames" if height[worst] > 0.0 else "the white"
+    advice = (
+        f"a lamp with narrow lines, such as a room's lamp or a screen, shone on {lit_alone} only; switch it off and "
+        "take them again"
+    )
+    limits = LINE_AMBER, LINE_RED
+    return [judged("light-lines", float(np.abs(height[worst])), limits, f"{session.path}: {text}", advice)]
+
+
+def line_heights(spectra: Float[np.ndarray, "pixels bands"], window: int) -> Float[np.ndarray, "bands"]:
+    """Median over pixels of how far each band lies above the median of its neighbours, as a fraction.
+
+    A median over bands leaves slopes and edges as they are.
+    """
+    beside = median_filter(spectra, (1, window), mode="nearest")
+    return np.median(spectra / np.maximum(beside, 1e-6) - 1.0, axis=0)
+
+
+def bright_pixels(light: Float[np.ndarray, "rows samples bands"]) -> Float[np.ndarray, "pixels bands"]:
+    """Spectra of the brighter pixels, evenly chosen."""
+    brightness = light.mean(axis=-1)
+    bright = light[brightness > BRIGHT * np.percentile(brightness, 99.0)]
+    return bright[:: max(1, len(bright) // PIXELS)]
