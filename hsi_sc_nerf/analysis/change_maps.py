@@ -110,6 +110,10 @@ def changes(
     conditions = np.column_stack([worst, -to_rim_m])
     modes = session_sd * np.stack([np.ones(len(one.wavelengths_nm)), np.linspace(-1.0, 1.0, len(one.wavelengths_nm))])
     typical = np.median(one.spectra[seen], axis=0)[None]
+    usual, *moved = (
+        _scalars(x, one.wavelengths_nm, bands_nm, indices) for x in (typical, *(typical * (1.0 + m) for m in modes))
+    )
+    quantities = (len(one.wavelengths_nm) > 1) + len(usual) + 1  # spectrum, scalars, surface
 
     def tested(
         name: str,
@@ -124,7 +128,8 @@ def changes(
         slopes = np.linalg.norm(surface_gradients(patches.centres_m, patches.means(first, one.areas_m2)), axis=2)
         off = np.nan_to_num(slopes) * misplaced_m * (name != SURFACE)
         errors = of_repeat[0] if of_repeat else None
-        test = significance(of_patches, patches.centres_m, off, shared, conditions, errors, to_rim_m < RIM_M)
+        at_rim = to_rim_m < RIM_M
+        test = significance(of_patches, patches.centres_m, off, shared, conditions, errors, at_rim, quantities)
         p = np.where(seen, test.p[patches.of_vertex], 1.0)
         beyond, significant = last - first - test.whole, test.p < FALSE_DISCOVERIES
         region, regions = changed_regions(
@@ -142,9 +147,6 @@ def changes(
         found[SPECTRUM] = tested(
             SPECTRUM, "rad", [each @ axes.T for each in units], np.linalg.norm(shared @ axes.T, axis=0), angle
         )
-    usual, *moved = (
-        _scalars(x, one.wavelengths_nm, bands_nm, indices) for x in (typical, *(typical * (1.0 + m) for m in modes))
-    )
     measured = [_scalars(day.surface.spectra, one.wavelengths_nm, bands_nm, indices) for day in days]
     for name in usual:
         values = [each[name][:, None] for each in measured]

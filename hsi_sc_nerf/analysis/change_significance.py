@@ -102,6 +102,7 @@ def significance(
     conditions: Float[np.ndarray, "p c"] | None = None,
     repeat: Float[np.ndarray, "p k"] | None = None,
     rim: Bool[np.ndarray, "p"] | None = None,
+    quantities: int = 1,
 ) -> Significance:
     """Test each patch's change against the errors that the changes of all patches show.
 
@@ -123,6 +124,8 @@ def significance(
         conditions: what makes the errors of a patch larger, each column the larger the harder; none by default.
         repeat: change of each patch from the first day to another capture of it, NaN where it is not known.
         rim: which patches lie at the rim of what is seen; none by default.
+        quantities: of the same surface that are tested with this one. Each is held to its part of the false
+            discoveries (Bonferroni), so that all of them together make no more.
 
     Example:
         >>> centres_m = np.random.default_rng(0).random((400, 3))
@@ -159,7 +162,7 @@ def significance(
     of_like = min(of_all, _OBSERVATIONS) if hard.shape[1] else of_all
     p = np.ones(len(change))
     of_patches = hotelling_p(squares, dimensions, max(of_like, dimensions + 2.0))
-    p[known] = stats.false_discovery_control(of_patches, method="by")
+    p[known] = np.minimum(quantities * stats.false_discovery_control(of_patches, method="by"), 1.0)
     # The median of normal errors has pi / 2 times the variance of the mean.
     usual = np.median(noise, axis=0)
     whole_sd = np.sqrt(np.pi / 2.0 * np.square(usual) / independent + np.square(session_sd))
