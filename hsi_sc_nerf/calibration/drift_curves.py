@@ -34,7 +34,7 @@ def common_courses(
     coefficients: Float[np.ndarray, "frames terms"],
     covariance: Float[np.ndarray, "terms terms"],
     basis: Float[np.ndarray, "bands terms"],
-    roughness: Float[np.ndarray, "terms"] | None = None,
+    roughness: Float[np.ndarray, "terms"],
 ) -> tuple[Float[np.ndarray, "frames bands"], Float[np.ndarray, "frames bands"]]:
     """The curves of all frames less the first frame's, from few courses with one spectrum each; and their variance.
 
@@ -47,9 +47,8 @@ def common_courses(
     Args:
         covariance: of one frame's coefficients; terms with a roughness have an error of their own.
         basis: terms over the bands.
-        roughness: of each term, 0 for those that are not penalised; all 0 if not given.
+        roughness: of each term, 0 for those that are not penalised.
     """
-    roughness = np.zeros(len(covariance)) if roughness is None else roughness
     root = np.linalg.cholesky(covariance)
     whitened = np.linalg.solve(root, (coefficients - coefficients.mean(axis=0)).T).T
     left, singular, right = np.linalg.svd(whitened, full_matrices=False)

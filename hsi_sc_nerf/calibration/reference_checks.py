@@ -42,24 +42,6 @@ FRAMES, BRIGHT, PIXELS = 8, 0.3, 250
 """Number of compared frames; pixels above this fraction of the brightest are used; about this many of a frame."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Exposure:
-    """Counts and the dark reference that is subtracted from them."""
-
-    name: str
-    counts: Cube
-    counts_ms: float | None
-    dark: Cube | None
-
-    @property
-    def other_time(self) -> bool:
-        """Whether the headers state different integration times for the two."""
-        dark_ms = None if self.dark is None else self.dark.integration_time_ms
-        if dark_ms is None or self.counts_ms is None:
-            return False
-        return max(dark_ms, self.counts_ms) > DIFFERENT_TIME * min(dark_ms, self.counts_ms)
-
-
 def check_dark(
     session: Session,
     source: Literal["auto"] | WhiteSource = "auto",
@@ -121,6 +103,67 @@ def check_dark(
     return Finding("dark", "green", "Dark references: every capture has one, without light.", values)
 
 
+def check_lines(
+    session: Session,
+    frames: Sequence[Float[np.ndarray, "pixels bands"]],
+    source: Literal["auto"] | WhiteSource = "auto",
+) -> list[Finding]:
+    """The finding ``light-lines``, for sessions with narrow bands and a white of their own.
+
+    Args:
+        session: its captures.
+        frames: counts above dark of brighter pixels of each frame (`bright_pixels`).
+        source: where the white is.
+
+    Raises:
+        InputError: the session does not have that source of white.
+    """
+    found = checked_source(session, source)
+    wavelengths_nm = session.wavelengths_nm
+    steps_nm = np.abs(np.diff(wavelengths_nm))
+    if found == "product" or len(wavelengths_nm) < FEWEST_BANDS or np.median(steps_nm) > LARGEST_STEP_NM:
+        return []
+    cube, dark = white_cubes(session, found)
+    white = bright_pixels(light_of_some_lines(cube, dark)).mean(axis=0)
+    lit = (white >= LEAST_WHITE * white.max()) & cube.good_bands
+    if np.count_nonzero(lit) < FEWEST_BANDS:
+        return []
+    chosen = np.unique(np.linspace(0, len(session.frames) - 1, FRAMES).astype(int)).tolist()
+    spectra = [frames[number][:, lit] / white[lit] for number in chosen]
+    window = 2 * round(WINDOW_NM / 2.0 / float(np.median(steps_nm))) + 1
+    height = line_heights(np.concatenate(spectra), window)
+    worst = int(np.abs(height).argmax())
+    text = (
+        f"at {wavelengths_nm[lit][worst]:.0f} nm the reflectance of all frames differs by "
+        f"{100.0 * abs(height[worst]):.2g} % from that in the neighbouring bands"
+    )
+    lit_alone = "the frames" if height[worst] > 0.0 else "the white"
+    advice = (
+        f"a lamp with narrow lines, such as a room's lamp or a screen, shone on {lit_alone} only; switch it off and "
+        "take them again"
+    )
+    limits = LINE_AMBER, LINE_RED
+    return [judged("light-lines", float(np.abs(height[worst])), limits, f"{session.path}: {text}", advice)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Exposure:
+    """Counts and the dark reference that is subtracted from them."""
+
+    name: str
+    counts: Cube
+    counts_ms: float | None
+    dark: Cube | None
+
+    @property
+    def other_time(self) -> bool:
+        """Whether the headers state different integration times for the two."""
+        dark_ms = None if self.dark is None else self.dark.integration_time_ms
+        if dark_ms is None or self.counts_ms is None:
+            return False
+        return max(dark_ms, self.counts_ms) > DIFFERENT_TIME * min(dark_ms, self.counts_ms)
+
+
 def _exposures(session: Session, source: WhiteSource) -> list[_Exposure]:
     """What a dark reference is subtracted from."""
     captures = session.captures if source == "tarp" else session.frames
@@ -163,49 +206,6 @@ def _without_any(session: Session, exposures: Sequence[_Exposure]) -> Finding:
         "the detector's offset; take a dark reference with a covered lens."
     )
     return Finding("dark", "amber", sentence, values)
-
-
-def check_lines(
-    session: Session,
-    frames: Sequence[Float[np.ndarray, "pixels bands"]],
-    source: Literal["auto"] | WhiteSource = "auto",
-) -> list[Finding]:
-    """The finding ``light-lines``, for sessions with narrow bands and a white of their own.
-
-    Args:
-        session: its captures.
-        frames: counts above dark of brighter pixels of each frame (`bright_pixels`).
-        source: where the white is.
-
-    Raises:
-        InputError: the session does not have that source of white.
-    """
-    found = checked_source(session, source)
-    wavelengths_nm = session.wavelengths_nm
-    steps_nm = np.abs(np.diff(wavelengths_nm))
-    if found == "product" or len(wavelengths_nm) < FEWEST_BANDS or np.median(steps_nm) > LARGEST_STEP_NM:
-        return []
-    cube, dark = white_cubes(session, found)
-    white = bright_pixels(light_of_some_lines(cube, dark)).mean(axis=0)
-    lit = (white >= LEAST_WHITE * white.max()) & cube.good_bands
-    if np.count_nonzero(lit) < FEWEST_BANDS:
-        return []
-    chosen = np.unique(np.linspace(0, len(session.frames) - 1, FRAMES).astype(int)).tolist()
-    spectra = [frames[number][:, lit] / white[lit] for number in chosen]
-    window = 2 * round(WINDOW_NM / 2.0 / float(np.median(steps_nm))) + 1
-    height = line_heights(np.concatenate(spectra), window)
-    worst = int(np.abs(height).argmax())
-    text = (
-        f"at {wavelengths_nm[lit][worst]:.0f} nm the reflectance of all frames differs by "
-        f"{100.0 * abs(height[worst]):.2g} % from that in the neighbouring bands"
-    )
-    lit_alone = "the frames" if height[worst] > 0.0 else "the white"
-    advice = (
-        f"a lamp with narrow lines, such as a room's lamp or a screen, shone on {lit_alone} only; switch it off and "
-        "take them again"
-    )
-    limits = LINE_AMBER, LINE_RED
-    return [judged("light-lines", float(np.abs(height[worst])), limits, f"{session.path}: {text}", advice)]
 
 
 def line_heights(spectra: Float[np.ndarray, "pixels bands"], window: int) -> Float[np.ndarray, "bands"]:

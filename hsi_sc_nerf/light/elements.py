@@ -15,9 +15,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.evaluation.spatial import sample_surface
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, unit_vectors
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, image_coordinates, unit_vectors
 from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene, unoccluded
-from hsi_sc_nerf.geometry.ray_projection import image_coordinates
 from hsi_sc_nerf.light.views import Views
 
 SUPPORT_SIDES = 25

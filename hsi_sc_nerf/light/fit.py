@@ -21,12 +21,11 @@ from scipy.spatial import cKDTree
 from hsi_sc_nerf.geometry.camera import unit_vectors
 from hsi_sc_nerf.light.shared_errors import CORRELATED, SMALLEST_SCATTER, SharedErrors, scatter_beyond, tukey_weights
 from hsi_sc_nerf.light.stationary_light import (
-    DEGREE,
+    DEGREE_OF_TERM,
     TERMS,
     StationaryLight,
     even_directions,
     even_light,
-    harmonic_degrees,
     tangents,
     unit_irradiance,
 )
@@ -281,7 +280,7 @@ class _Fit:
         """Precision of the parameters' prior, and its gradient at their present values."""
         light, lamps = self.light, len(self.light.lamps)
         precision = np.zeros(TERMS + 3 * lamps + (lamps > 0))
-        precision[:TERMS] = np.where(harmonic_degrees(DEGREE) > 0, self.unevenness**-2.0, 0.0)
+        precision[:TERMS] = np.where(DEGREE_OF_TERM > 0, self.unevenness**-2.0, 0.0)
         precision[TERMS : TERMS + lamps] = LAMP_STD**-2.0
         precision[TERMS + lamps : TERMS + 3 * lamps] = TURN_STD_RAD**-2.0
         if lamps:
@@ -321,7 +320,7 @@ class _Fit:
 
     def _estimate_unevenness(self, covariance: np.ndarray) -> None:
         """Root mean square of the chamber's harmonics, weighted by how well the views show them (MacKay 1992)."""
-        uneven = harmonic_degrees(DEGREE) > 0
+        uneven = DEGREE_OF_TERM > 0
         seen = np.clip(1.0 - np.diag(covariance)[:TERMS] / self.unevenness**2, 0.0, 1.0)[uneven].sum()
         square = (self.light.chamber[uneven] ** 2).sum() + UNEVENNESS_COUNT * UNEVENNESS**2
         self.unevenness = min(float(np.sqrt(square / (seen + UNEVENNESS_COUNT))), MOST_UNEVEN)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.special import sph_harm_y
 
 from hsi_sc_nerf.geometry.camera import unit_vectors
@@ -19,6 +19,7 @@ from hsi_sc_nerf.geometry.camera import unit_vectors
 DEGREE = 2
 """Largest degree of the chamber's harmonics: irradiance hardly shows higher ones (Ramamoorthi and Hanrahan 2001)."""
 TERMS = (DEGREE + 1) ** 2
+DEGREE_OF_TERM = np.repeat(np.arange(DEGREE + 1), 2 * np.arange(DEGREE + 1) + 1)
 FINE_DIRECTIONS = 1 << 13
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 LOBE_WIDTH_RAD = 0.08
@@ -63,7 +64,7 @@ def unit_irradiance(
     fine = even_directions(FINE_DIRECTIONS)
     cosines = np.maximum(fine @ normal, 0.0)
     cosines /= cosines.sum()
-    return cosines @ harmonics(fine, DEGREE), cosines @ lobes(fine, to_lamps)
+    return cosines @ harmonics(fine), cosines @ lobes(fine, to_lamps)
 
 
 def even_directions(count: int) -> Float[np.ndarray, "count 3"]:
@@ -74,21 +75,15 @@ def even_directions(count: int) -> Float[np.ndarray, "count 3"]:
     return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], axis=-1)
 
 
-def harmonics(directions: Float[np.ndarray, "n 3"], degree: int) -> Float[np.ndarray, "n terms"]:
-    """Real spherical harmonics up to ``degree``, (degree + 1)^2 terms by rising degree; their mean square is 1."""
+def harmonics(directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n terms"]:
+    """Real spherical harmonics up to `DEGREE`, by ascending degree (`DEGREE_OF_TERM`); their mean square is 1."""
     polar = np.arccos(np.clip(directions[:, 2], -1.0, 1.0))
     azimuth = np.arctan2(directions[:, 1], directions[:, 0])
-    degrees = harmonic_degrees(degree)
-    orders = np.arange(len(degrees)) - degrees * (degrees + 1)
-    terms = sph_harm_y(degrees, np.abs(orders), polar[:, None], azimuth[:, None])
+    orders = np.arange(TERMS) - DEGREE_OF_TERM * (DEGREE_OF_TERM + 1)
+    terms = sph_harm_y(DEGREE_OF_TERM, np.abs(orders), polar[:, None], azimuth[:, None])
     return (
         np.sqrt(4.0 * np.pi) * np.where(orders == 0, 1.0, np.sqrt(2.0)) * np.where(orders < 0, terms.imag, terms.real)
     )
-
-
-def harmonic_degrees(degree: int) -> Int[np.ndarray, "terms"]:
-    """Degree of each term of `harmonics`."""
-    return np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)
 
 
 def lobes(

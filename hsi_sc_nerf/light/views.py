@@ -10,7 +10,7 @@ import scipy.sparse
 from jaxtyping import Bool, Float, Int
 
 from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene
-from hsi_sc_nerf.light.stationary_light import DEGREE, LOBE_WIDTH_RAD, StationaryLight, harmonics, lobes, tangents
+from hsi_sc_nerf.light.stationary_light import LOBE_WIDTH_RAD, StationaryLight, harmonics, lobes, tangents
 
 RAYS_AT_ONCE = 1 << 21
 BOUNCES = 4
@@ -199,7 +199,7 @@ class TurningElements:
 
     @cached_property
     def _harmonics(self) -> list[Float[np.ndarray, "directions terms"]]:
-        return [harmonics(self.directions @ rotation, DEGREE).astype(np.float32) for rotation in self.rotations]
+        return [harmonics(self.directions @ rotation).astype(np.float32) for rotation in self.rotations]
 
 
 def _cell_numbers(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:

@@ -15,8 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hsi_sc_nerf.data.background_image import background_cell_px, estimate_static_background
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.geometry.ray_projection import image_coordinates, in_camera_frame
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, image_coordinates, in_camera_frame
 from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
 
 

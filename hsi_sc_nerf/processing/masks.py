@@ -93,7 +93,7 @@ def foreground_masks(
         raise InputError(f"--masks.pieces is {config.pieces}, but must be 1 or more; correct it.")
     background = background_subspace(bins, regions)
     scores = [foreground_score(image, background) for image in bins]
-    threshold = select_threshold(scores, config.threshold)
+    threshold = select_threshold(scores) if config.threshold is None else config.threshold
     lowest = _background_level(scores, threshold)
     weak_fraction = max(config.weak_fraction, min(1.0, lowest / threshold))
     masks, left_out = [], []
@@ -119,14 +119,12 @@ def _background_level(scores: Sequence[Float[np.ndarray, "h w"]], threshold: flo
     return float(np.median(low) + 6.0 * median_abs_deviation(low, scale="normal"))
 
 
-def select_threshold(scores: Sequence[Float[np.ndarray, "h w"]], threshold: float | None = None) -> float:
-    """The given threshold, or Otsu's if its contrast is at least `MIN_CONTRAST`.
+def select_threshold(scores: Sequence[Float[np.ndarray, "h w"]]) -> float:
+    """Otsu's threshold, if it separates object and background by `MIN_CONTRAST` and `MIN_SEPARATION`.
 
     Raises:
         InputError: the spectra of object and background hardly differ.
     """
-    if threshold is not None:
-        return threshold
     threshold, contrast, separation = otsu_threshold(scores)
     if contrast < MIN_CONTRAST or separation < MIN_SEPARATION:
         raise InputError(

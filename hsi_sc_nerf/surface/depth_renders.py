@@ -15,8 +15,7 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from hsi_sc_nerf.data.dataparser import FRAME_INDEX
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.geometry.ray_projection import image_coordinates, in_camera_frame
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, image_coordinates, in_camera_frame
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.surface.surface_depth import MIN_COSINE, MIN_OPACITY, camera_rays, surface_depth

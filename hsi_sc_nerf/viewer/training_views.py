@@ -9,8 +9,7 @@ from torch import Tensor
 
 from hsi_sc_nerf.data.datamanager import SpectralDataset
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_angle_map
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.geometry.ray_projection import image_coordinates, in_camera_frame
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, image_coordinates, in_camera_frame
 from hsi_sc_nerf.packed.cube import unpack
 
 SAME_POSITION = 1e-4

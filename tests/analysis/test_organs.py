@@ -13,6 +13,7 @@ def overlap(found, true):
     return (found & true).sum() / (found | true).sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cap_at", [-1.0, 1.0])
 def test_a_ball_with_a_cap_and_a_rod_has_body_stem_and_calyx(cap_at):
     """Also where the rod stands on the cap. Each point has one organ."""

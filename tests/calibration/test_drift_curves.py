@@ -36,7 +36,7 @@ def test_frames_tell_course_and_spectrum_of_the_drift_together(name, of_one_fram
     scores, squares = [], []
     for _ in range(200):
         noise = np.sqrt(np.diag(covariance)) * rng.standard_normal(true.shape)
-        curves, variance = common_courses(true + noise, covariance, basis)
+        curves, variance = common_courses(true + noise, covariance, basis, np.zeros(len(covariance)))
         np.testing.assert_array_equal(curves[0], 0.0)
         np.testing.assert_array_equal(variance[0], 0.0)
         scores.append(np.square(curves - relative)[1:] / variance[1:])
@@ -53,7 +53,7 @@ def test_a_frame_that_contradicts_a_smooth_course_is_taken_as_measured():
     true = np.outer(course, [1.0, 0.0, 0.0, 0.0])
     errors, stated = [], []
     for _ in range(200):
-        curves, variance = common_courses(true + rng.standard_normal(true.shape), np.eye(4), np.eye(4))
+        curves, variance = common_courses(true + rng.standard_normal(true.shape), np.eye(4), np.eye(4), np.zeros(4))
         errors.append((curves - (true - true[0]))[flash, 0])
         stated.append(variance[flash, 0])
     # A third of it by chance is still smooth enough.
@@ -72,7 +72,7 @@ def test_a_second_course_comes_out_of_the_noise_little_by_little():
     found = []
     for strength in np.arange(0.5, 1.6, 0.005) * noise_edge:
         drift = courses @ np.stack([20.0 * np.eye(terms)[0], strength * np.eye(terms)[1]])
-        found.append(common_courses(drift + noise, np.eye(terms), np.eye(terms))[0][:, 1])
+        found.append(common_courses(drift + noise, np.eye(terms), np.eye(terms), np.zeros(terms))[0][:, 1])
     steps = np.linalg.norm(np.diff(found, axis=0), axis=1)
     assert steps.max() < 0.15 * noise_edge
     # It is nearly all there at the end.

@@ -140,6 +140,7 @@ def test_a_disk_that_fills_up_in_process_is_one_line_and_leaves_nothing_half_wri
     assert not (out / "transforms.json").exists()
 
 
+@pytest.mark.slow
 def test_help_loads_no_numerical_library_and_a_command_only_its_own():
     """Loading all of them takes seconds."""
     code = """

@@ -4,9 +4,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.light.stationary_light import (
+    DEGREE_OF_TERM,
     LOBE_WIDTH_RAD,
     even_directions,
-    harmonic_degrees,
     harmonics,
     lobes,
     tangents,
@@ -21,18 +21,17 @@ def test_even_directions_integrate_polynomials():
 
 
 def test_harmonics_are_orthonormal_and_begin_with_one():
-    terms = harmonics(even_directions(8192), 3)
-    np.testing.assert_allclose(terms.T @ terms / 8192, np.eye(16), atol=1e-3)
+    terms = harmonics(even_directions(8192))
+    np.testing.assert_allclose(terms.T @ terms / 8192, np.eye(9), atol=1e-3)
     np.testing.assert_allclose(terms[:, 0], 1.0)
-    assert harmonic_degrees(3).tolist() == [0] + 3 * [1] + 5 * [2] + 7 * [3]
+    assert DEGREE_OF_TERM.tolist() == [0] + 3 * [1] + 5 * [2]
 
 
 def test_a_turn_mixes_harmonics_of_one_degree_alone():
     directions = even_directions(512)
-    turned = harmonics(directions @ Rotation.from_rotvec([0.3, -1.0, 0.5]).as_matrix(), 2)
-    mixing = np.linalg.lstsq(harmonics(directions, 2), turned, rcond=None)[0]
-    degrees = harmonic_degrees(2)
-    np.testing.assert_allclose(mixing[degrees[:, None] != degrees], 0.0, atol=1e-9)
+    turned = harmonics(directions @ Rotation.from_rotvec([0.3, -1.0, 0.5]).as_matrix())
+    mixing = np.linalg.lstsq(harmonics(directions), turned, rcond=None)[0]
+    np.testing.assert_allclose(mixing[DEGREE_OF_TERM[:, None] != DEGREE_OF_TERM], 0.0, atol=1e-9)
     np.testing.assert_allclose(mixing.T @ mixing, np.eye(9), atol=1e-9)
 
 

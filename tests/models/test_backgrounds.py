@@ -3,8 +3,14 @@ import numpy as np
 import torch
 
 from hsi_sc_nerf.data.dataparser import CAMERA_ROTATION, pinhole_cameras
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, turntable_camera_to_world
-from hsi_sc_nerf.geometry.ray_projection import image_coordinates, in_camera_frame
+from hsi_sc_nerf.geometry.camera import (
+    PinholeIntrinsics,
+    image_coordinates,
+    in_camera_frame,
+    look_at,
+    pixel_rays,
+    turntable_camera_to_world,
+)
 from hsi_sc_nerf.models.backgrounds import Background, interpolate_image
 
 LENS = PinholeIntrinsics(60, 40, 80.0, 85.0, 31.0, 18.5)

@@ -11,8 +11,7 @@ from PIL import Image
 
 from hsi_sc_nerf.cli.trained_runs import RenderCommand
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import pixel_rays
-from hsi_sc_nerf.geometry.ray_projection import in_camera_frame
+from hsi_sc_nerf.geometry.camera import in_camera_frame, pixel_rays
 from hsi_sc_nerf.models import trained_run
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.rendering.pictures import find_false_colour, open_video
