@@ -169,5 +169,8 @@ def _settings_of(row: Row, settings: SessionSettings) -> SessionSettings:
         raise InputError(f"the object {row[OBJECT]}: its preset {shown(preset)} is none; there are {choices}.")
     process, train = (f"{getattr(settings, key)} {row.get(key, '')}".strip() for key in ("process", "train"))
     for text in (process, train):
-        split_words(text)
+        try:
+            split_words(text)
+        except InputError as error:
+            raise InputError(f"the object {row[OBJECT]}: {error}") from error
     return replace(settings, preset=cast(Preset, preset), process=process, train=train)
