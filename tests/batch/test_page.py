@@ -109,7 +109,7 @@ def test_sorting_by_mouse_and_keyboard_with_missing_values_last(browser, season)
         # Each name stands in its own cell, not over the next one.
         right = "(all) => all.map((one) => one.getBoundingClientRect().right)"
         ends = zip(
-            page.locator("tbody th span").evaluate_all(right),
+            page.locator("tbody th .object > span").evaluate_all(right),
             page.locator("tbody th").evaluate_all(right),
             strict=True,
         )
