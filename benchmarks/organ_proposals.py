@@ -83,8 +83,8 @@ class OrganProposals:
     errors: tuple[str, ...] = tuple(ERRORS)
     """Which errors their clouds have."""
     trained: tuple[Path, ...] = ()
-    """Folders of simulated sessions and the clouds that runs exported of them, whose rows are added: a row for all of
-    one object and size."""
+    """Folders of simulated sessions, runs of them and the clouds that these exported, whose rows are added: a row for
+    all of one object, preset and size."""
     results: Path = RESULTS
     """Folder of the CSV file."""
     picture: Path | None = None
@@ -100,7 +100,10 @@ class OrganProposals:
         trained: dict[tuple[str, str], list[Path]] = {}
         for folder in self.trained:
             truth = load_truth(folder / "session")
-            cloud = f"trained on {len(truth.captures)} views of {truth.intrinsics.w} px"
+            preset = (
+                next(folder.rglob("config.yml")).read_text(encoding="utf-8").partition("\npreset: ")[2].split()[0]
+            )
+            cloud = f"trained by {preset} on {len(truth.captures)} views of {truth.intrinsics.w} px"
             trained.setdefault((truth.object, cloud), []).append(folder)
         for (name, cloud), folders in track(trained.items(), "Proposing on trained clouds"):
             self._write(name, cloud, [_trained(folder) for folder in folders], " ".join(one.name for one in folders))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,7 +39,13 @@ class NumberTable:
     lines: tuple[int, ...]
 
     def by_title(self) -> dict[str, Float[np.ndarray, "rows"]]:
-        """Columns by their titles in lower case, units left out; a wavelength's becomes ``wavelength_nm``."""
+        """Columns by their titles in lower case, units left out; a wavelength's becomes ``wavelength_nm``.
+
+        Raises:
+            ValueError: the columns have no titles.
+        """
+        if self.numbers.size and not self.titles:
+            raise ValueError("its first line holds numbers and not the columns' titles")
         columns = {}
         for title, column in zip(self.titles, self.numbers.T, strict=True):
             name, nm_per_unit = _name_and_nm(title)
@@ -47,7 +53,7 @@ class NumberTable:
         return columns
 
 
-def read_number_table(path: Path, columns: int | None = None) -> NumberTable:
+def read_number_table(path: Path, columns: int | None = None, blanks: Collection[str] = ()) -> NumberTable:
     """Read a table of numbers: UTF-8, UTF-16 or Western European; separated by commas, semicolons or tabs.
 
     The decimal mark is a point, or a comma where cells are separated otherwise or quoted. Empty lines are skipped,
@@ -55,6 +61,7 @@ def read_number_table(path: Path, columns: int | None = None) -> NumberTable:
 
     Args:
         columns: read so many from the left; the others may hold anything.
+        blanks: words, in lower case, that stand for no number, as NA does.
 
     Raises:
         OSError: the file cannot be read.
@@ -82,6 +89,7 @@ def read_number_table(path: Path, columns: int | None = None) -> NumberTable:
     rows = _without_empty_columns([[cell.strip() for cell in row[:columns]] for row in rows])
     titles = () if all(_is_number(cell) for cell in rows[0]) else tuple(rows[0])
     rows, lines = rows[bool(titles) :], [number for number, _ in numbered[bool(titles) :]]
+    rows = [["" if cell.lower() in blanks else cell for cell in row] for row in rows]
     width = len(titles or rows[0])
     for number, row in zip(lines, rows, strict=True):
         if len(row) != width:

@@ -33,13 +33,13 @@ def write(folder, text, encoding="utf-8", name="own.csv"):
 def test_exports_hold_the_same_numbers(tmp_path, text, encoding):
     if encoding == "cp1252":
         text = text.replace("\N{MINUS SIGN}", "-")
-    path = write(tmp_path, text, encoding)
+    path = write(tmp_path, "# intercept: 14,2\n" + text, encoding)
     columns = read_number_table(path).by_title()
     np.testing.assert_allclose(columns["wavelength_nm"], NM)
     np.testing.assert_allclose(columns["coefficient"], SLOPES)
     calibration = read_calibration(path)
     assert calibration.unit == "%"
-    np.testing.assert_allclose(calibration.values(np.array([[0.5, 0.25, 9.0]])), [0.0065 - 0.00525])
+    np.testing.assert_allclose(calibration.values(np.array([[0.5, 0.25, 9.0]])), [14.2 + 0.0065 - 0.00525])
 
 
 def test_heads_of_a_calibration_that_a_spreadsheet_saved(tmp_path):
@@ -53,6 +53,20 @@ def test_heads_of_a_calibration_that_a_spreadsheet_saved(tmp_path):
     assert calibration.predict(np.zeros((1, 3))).item() == 14.2
     assert calibration.domain.t2_limit == 5.5
     np.testing.assert_array_equal(calibration.domain.variances, [0.5, 2.0])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "Wavelength (nm);B\nB0;14,2\n450;0,5\n460;\n",
+        '"Wavelength [nm]","Regression Coefficients"\n"(Intercept)","14,2"\n"450,0","0,5"\n"460,0",\n',
+        "wavelength\tcoefficients\nIntercept\t14.2\n450\t0.5\n460\tNA\n",
+        "wavelength_nm,coefficient\n,14.2\n450,0.5\n460,\n",
+    ],
+)
+def test_an_intercept_in_the_first_line_as_software_writes_it(tmp_path, text):
+    calibration = read_calibration(write(tmp_path, text))
+    np.testing.assert_allclose(calibration.values(np.array([[0.5, 9.0]])), [14.2 + 0.25])
 
 
 def test_other_tables_of_the_same_exports(tmp_path):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,9 +26,14 @@ _KEYS = {
     *("name", "unit", "preprocessing", "intercept", "error"),
     *("t2_limit", "q_limit", "score_variances", "model", "column", "classes"),
 }
+_COEFFICIENTS = ("coefficients", "regression_coefficient", "regression_coefficients", "b")
+"""Titles that software gives the column ``coefficient``."""
+_INTERCEPTS = ("b0", "intercept", "(intercept)")
+"""What it writes in place of a wavelength before the intercept."""
 _SAME_BAND_NM = 0.05
 """Tables round wavelengths."""
 _CHUNK_SPECTRA = 1 << 13
+_MOST_LISTED = 6
 _FATAL = 4  # of onnxruntime's levels; it logs past Python, beside our sentences
 _REMEDY = "docs/how-to/calibrations.md shows such a table"
 
@@ -197,15 +202,19 @@ def read_calibration(path: Path | str) -> Calibration:
         head, columns = _read_table(path)
         if unknown := head.keys() - _KEYS:
             raise ValueError(f"{', '.join(sorted(unknown))} is no known key; known are {', '.join(sorted(_KEYS))}")
-        nm = columns.pop("wavelength_nm", np.empty(0))
+        if "wavelength_nm" not in columns:
+            raise ValueError(f"it needs a column wavelength_nm and has {_listed(columns)}")
+        nm = columns.pop("wavelength_nm")
         if not (len(nm) and np.isfinite(nm).all() and (np.diff(nm) > 0).all()):
-            raise ValueError("it needs a column wavelength_nm that ascends")
+            raise ValueError("its column wavelength_nm needs a number in each line, in ascending order")
         coefficients = columns.get("coefficient", np.ones(len(nm)))
         used = np.isfinite(coefficients)
         steps = read_steps(head.get("preprocessing", "").replace(";", ","), used)
         reference = columns.get("reference", np.full(len(nm), np.nan))
         if any(name == "msc" for name, _ in steps) and not np.isfinite(reference).all():
             raise ValueError("msc needs a column reference")
+        if "coefficient" in columns and "model" not in head and "intercept" not in head:
+            raise ValueError("it has no '# intercept:'; add the model's, which is 0 if it has none")
         numbers = {key: number_in(head.get(key, "0")) for key in ("intercept", "error")}
         if not (all(map(math.isfinite, numbers.values())) and numbers["error"] >= 0.0 and used.any()):
             raise ValueError("its intercept and error are no finite numbers, or it has no coefficient")
@@ -224,16 +233,39 @@ def read_calibration(path: Path | str) -> Calibration:
         def predict(spectra: np.ndarray) -> np.ndarray:
             return spectra @ slopes[:, None] + intercept
     else:
-        raise InputError(f"{path}: has neither a column coefficient nor a '# model:'; {_REMEDY}.")
+        raise InputError(
+            f"{path}: has neither a column coefficient nor a '# model:', but {_listed(columns)}; {_REMEDY}."
+        )
     name, unit = head.get("name", path.stem), head.get("unit", "")
     return Calibration(name, unit, numbers["error"], nm, steps, used, reference, predict, domain, classes)
 
 
 def _read_table(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
-    """``# key: value`` lines, and the columns by name; empty cells are NaN."""
-    table = read_number_table(path)
+    """``# key: value`` lines, and the columns by name; empty cells are NaN.
+
+    An intercept in the first line moves to the others.
+
+    Raises:
+        ValueError: it is no table, or has two intercepts.
+    """
+    table = read_number_table(path, blanks=_INTERCEPTS)
     pairs = (note.partition(":") for note in table.notes if ":" in note)
-    return {key.strip().lower(): value.strip(" ;,\t") for key, _, value in pairs}, table.by_title()
+    head, columns = {key.strip().lower(): value.strip(" ;,\t") for key, _, value in pairs}, table.by_title()
+    for title in _COEFFICIENTS:
+        if title in columns and "coefficient" not in columns:
+            columns["coefficient"] = columns.pop(title)
+    if "coefficient" in columns and math.isnan(columns.get("wavelength_nm", np.zeros(1))[:1].sum()):
+        if "intercept" in head:
+            raise ValueError("it has two intercepts, one as '# intercept:' and one in its first line")
+        head["intercept"] = str(columns["coefficient"][0])
+        columns = {name: column[1:] for name, column in columns.items()}
+    return head, columns
+
+
+def _listed(columns: Collection[str]) -> str:
+    """Names of columns in a sentence, the first few of many."""
+    shown = ", ".join(list(columns)[:_MOST_LISTED])
+    return f"{shown}, ..." if len(columns) > _MOST_LISTED else shown or "none"
 
 
 def _domain(head: dict[str, str], columns: dict[str, np.ndarray]) -> Domain | None:
@@ -272,6 +304,8 @@ def _onnx_model(table: Path, name: str, bands: int, columns: slice) -> Callable[
     except ImportError as error:
         raise InputError(f"{name} needs onnxruntime; install it: pip install 'hsi-sc-nerf[calibrations]'.") from error
     path, wanted = table.with_name(Path(name).name), columns.stop - columns.start
+    if not path.is_file():
+        raise InputError(f"{path}: is missing, but {table.name} names it; put the model beside the table.")
     try:
         options = onnxruntime.SessionOptions()
         options.log_severity_level = _FATAL
@@ -290,7 +324,7 @@ def _onnx_model(table: Path, name: str, bands: int, columns: slice) -> Callable[
             raise ValueError(f"it gives {given} of {wanted}")
     except Exception as error:  # onnxruntime's exceptions have no common class
         raise InputError(
-            f"{path}: is no ONNX model of spectra of {bands} bands with {wanted} numbers from column {columns.start} "
-            f"of its last output on ({error}); {_REMEDY}."
+            f"{path}: is no ONNX model of spectra of {bands} bands whose last output has {wanted} columns from "
+            f"column {columns.start} on ({error}); {_REMEDY}."
         ) from error
     return predict

@@ -40,6 +40,9 @@ _LOWEST, _LEAST_EVENNESS = 0.01, 0.9
 """A part begins at the lower edge if it has some of the lowest points, this fraction of them. The contrast of its
 middle third to the rest, over that of its lower third: near 1 for an organ, whose upper third training may blur, and
 at most 0.82 where contrast falls to 0 evenly."""
+_STRIP = 0.06
+"""A part there of which no point is further from the rest than this fraction of the object's height is a strip of
+such pixels."""
 _STANDS_OFF = 0.7
 """Distance of a part's farthest point from the rest, over its length: 1 for a leaf, 0.5 for a spot."""
 
@@ -127,6 +130,9 @@ def _part_at_end(upper: bool, surface: _Surface, rest: Bool[np.ndarray, "n"]) ->
         return STEM, part, edge
     if size[2] >= _LONG * size[:2].max():
         return HUSK, part, edge
+    of_part = np.ptp(points_m[part], axis=0)
+    if of_part[2] > of_part[:2].max():  # a stub
+        return STEM, part, edge
     return CALYX if part.mean() <= _SMALL else None, part, edge
 
 
@@ -178,11 +184,14 @@ def _is_mixed_with_support(
 ) -> bool:
     """Whether a part at the lower edge is no organ, but pixels that are mixed with what the object stands on.
 
-    Mixed pixels hold less of it the higher they lie; the spectra of an organ do not change towards its edge.
+    Mixed pixels hold less of it the higher they lie; the spectra of an organ do not change towards its edge. A strip
+    of a pixel or two is all mixed.
     """
     height = surface.points_m[:, 2]
     if height[part].min() > np.quantile(height[rest], _LOWEST):
         return False
+    if _depth_m(surface.points_m, part) < _STRIP * np.ptp(height):
+        return True
     # 0 on the ring outside, 1 on that inside.
     contrast = (surface.features[part] @ edge.direction - edge.level) / edge.separation**2 + 0.5
     low, high = np.quantile(height[part], (1.0 / 3.0, 2.0 / 3.0))
@@ -195,9 +204,14 @@ def _stands_off(points_m: Float[np.ndarray, "n 3"], part: Bool[np.ndarray, "n"])
 
     The middle of a spot is half as far from the rest.
     """
-    own, others = points_m[part], points_m[~part]
+    own = points_m[part]
     length_m = 2.0 * np.linalg.norm(own - own.mean(axis=0), axis=1).max()
-    return bool(cKDTree(others).query(own)[0].max() > _STANDS_OFF * length_m)
+    return bool(_depth_m(points_m, part) > _STANDS_OFF * length_m)
+
+
+def _depth_m(points_m: Float[np.ndarray, "n 3"], part: Bool[np.ndarray, "n"]) -> float:
+    """Distance from the rest of the point of a part that is the farthest from it."""
+    return float(cKDTree(points_m[~part]).query(points_m[part])[0].max())
 
 
 _SEARCHES: tuple[Callable[[_Surface, Bool[np.ndarray, "n"]], _Part | None], ...] = (

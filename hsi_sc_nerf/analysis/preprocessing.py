@@ -8,7 +8,7 @@ from scipy.signal import savgol_filter
 
 Step = tuple[str, tuple[int, ...]]
 """Name and whole numbers of a step."""
-_KNOWN = "absorbance, snv, msc or savgol WINDOW POLYNOMIAL DERIVATIVE"
+_KNOWN = "absorbance, snv, msc or savgol WINDOW POLYNOMIAL DERIVATIVE, with spaces between the numbers"
 _NUMBERS = {"absorbance": 0, "snv": 0, "msc": 0, "savgol": 3}
 
 

@@ -38,6 +38,8 @@ _CAUSES = {
 """Words for the causes of `size_uncertainty`."""
 _CM2_PER_M2 = 1e4
 _LISTED_REGIONS = 20
+_ROUNDING = 1e-6
+"""A smaller standard deviation, as a fraction of the value, is that of single precision."""
 _MAP_NOTE = (
     "Mean ± standard deviation over the surface, weighted by area; in brackets, where it is known, the standard "
     "deviation of the mean, by how much frames disagree."
@@ -205,7 +207,7 @@ def _classifier_table(classifiers: Mapping[str, Any], regions: Mapping[str, Any]
 
 def _map_mean(value: Mapping[str, float | None]) -> str:
     std = value.get("std")
-    return _with_std(value["mean"], value["sd"]) + ("" if std is None else f" ({std:.2g})")
+    return _with_sd(value["mean"], value["sd"], digits=3) + ("" if std is None else f" ({std:.2g})")
 
 
 def _listed(causes: Iterable[str]) -> str:
@@ -228,16 +230,11 @@ def _reflectance_table(regions: Mapping[str, Mapping[str, float | None]]) -> Tra
         )
     rows = []
     for name, value in regions.items():
-        row = [name, _with_std(value["mean"], value["std"])]
+        row = [name, _with_sd(value["mean"], value["std"])]
         if lit:
-            row += [f"{value['measured']:.3f}", _with_std(value["irradiance"], value["irradiance_std"])]
+            row += [f"{value['measured']:.3f}", _with_sd(value["irradiance"], value["irradiance_std"])]
         rows.append(row)
     return TraitTable("Reflectance", note, header, rows)
-
-
-def _with_std(value: float | None, std: float | None) -> str:
-    shown = f"{math.nan if value is None else value:.3f}"
-    return shown if std is None else f"{shown} ± {std:.3f}"
 
 
 def _class_tables(classes: Mapping[str, Any], seen_m2: float) -> list[TraitTable]:
@@ -329,9 +326,10 @@ def _plain(value: MapMean) -> dict[str, float | None]:
     return {key: one if math.isfinite(one) else None for key, one in plain.items()}
 
 
-def _with_sd(value: float, sd: float) -> str:
-    """The standard deviation with two digits that count, the value with as many decimals."""
-    if not (math.isfinite(sd) and sd > 0.0):
-        return f"{value:.4g} ± {sd:.2g}"
-    decimals = max(0, 1 - math.floor(math.log10(float(f"{sd:.1e}"))))
+def _with_sd(value: float | None, sd: float | None, digits: int = 2) -> str:
+    """The standard deviation with so many digits that count, the value with as many decimals; of None nothing."""
+    if value is None or sd is None or not (math.isfinite(sd) and sd > _ROUNDING * abs(value)):
+        shown = f"{math.nan if value is None else value:.4g}"
+        return shown if sd is None else f"{shown} ± {sd:.2g}"
+    decimals = max(0, digits - 1 - math.floor(math.log10(float(f"{sd:.1e}"))))
     return f"{value:.{decimals}f} ± {sd:.{decimals}f}"

@@ -48,8 +48,14 @@ class PlannedObject:
         return self.folder / "steps" / f"{step}.json"
 
 
-def write_plan(out: Path, rows: Sequence[Row], settings: SessionSettings) -> None:
+def write_plan(out: Path, rows: Sequence[Row], settings: SessionSettings, kept: Path | None = None) -> None:
     """Keep what is to be done in ``out``, where `read_plan` finds it; what is unchanged is not written anew.
+
+    Args:
+        out: folder of the batch.
+        rows: its objects.
+        settings: of all.
+        kept: folder to keep the plan in instead; ``out`` stays as it is.
 
     Raises:
         InputError: words of a row cannot be used, or ``out`` holds other sessions under the names of these, lies in
@@ -58,21 +64,23 @@ def write_plan(out: Path, rows: Sequence[Row], settings: SessionSettings) -> Non
     for row in rows:
         _settings_of(row, settings)
     _require_free(out, rows)
-    make_folder(out)
+    kept = out if kept is None else kept
+    make_folder(kept)
     # The settings first: a list without them is not of a batch.
-    write_json(out / SETTINGS_NAME, asdict(settings))
+    write_json(kept / SETTINGS_NAME, asdict(settings))
     table = sessions_table(rows)
-    path = out / LIST_NAME
+    path = kept / LIST_NAME
     if not path.is_file() or path.read_text(encoding="utf-8") != table:
         with atomic_write(path) as (temporary,):
             temporary.write_text(table, encoding="utf-8")
 
 
-def read_plan(out: Path) -> dict[str, PlannedObject]:
+def read_plan(out: Path, kept: Path | None = None) -> dict[str, PlannedObject]:
     """The objects of a batch by their names.
 
     Args:
         out: folder of the batch.
+        kept: folder of the plan, if that is another.
 
     Raises:
         InputError: there is no batch, or its files were changed.
@@ -81,16 +89,17 @@ def read_plan(out: Path) -> dict[str, PlannedObject]:
         >>> read_plan(Path("season"))["pear_01"].step("process").words[:2]
         ('hsi-sc-nerf', 'process')
     """
-    known: Mapping[str, Any] = read_json(out / SETTINGS_NAME, _AGAIN)
+    kept = out if kept is None else kept
+    known: Mapping[str, Any] = read_json(kept / SETTINGS_NAME, _AGAIN)
     try:
         settings = SessionSettings(**known)
         _check_types(settings)
     except TypeError as error:
-        raise InputError(f"{out / SETTINGS_NAME}: are no settings of a batch; {_AGAIN}.") from error
+        raise InputError(f"{kept / SETTINGS_NAME}: are no settings of a batch; {_AGAIN}.") from error
     root = out.resolve() / OBJECTS_NAME
     return {
         row[OBJECT]: PlannedObject(Path(row[SESSION]), root / row[OBJECT], _settings_of(row, settings))
-        for row in read_sessions(out / LIST_NAME, may_be_gone=True)
+        for row in read_sessions(kept / LIST_NAME, may_be_gone=True)
     }
 
 
@@ -160,5 +169,8 @@ def _settings_of(row: Row, settings: SessionSettings) -> SessionSettings:
         raise InputError(f"the object {row[OBJECT]}: its preset {shown(preset)} is none; there are {choices}.")
     process, train = (f"{getattr(settings, key)} {row.get(key, '')}".strip() for key in ("process", "train"))
     for text in (process, train):
-        split_words(text)
+        try:
+            split_words(text)
+        except InputError as error:
+            raise InputError(f"the object {row[OBJECT]}: {error}") from error
     return replace(settings, preset=cast(Preset, preset), process=process, train=train)

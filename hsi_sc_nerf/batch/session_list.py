@@ -15,6 +15,7 @@ SETTINGS = ("preset", "process", "train")
 """Columns of a session's own settings."""
 _NAME = re.compile(r"[^\W_][\w.-]*")
 _NAME_RULE = "a name is of letters, digits, dots, dashes and underscores and begins with a letter or a digit"
+_DECIMAL_COMMA = re.compile(r"[+-]?\d+(,\d+)?")
 Row = dict[str, str]
 """Cells by column: the object, its session, and the user's own."""
 
@@ -24,8 +25,8 @@ def read_sessions(path: Path, may_be_gone: bool = False) -> list[Row]:
 
     Args:
         path: a folder whose folders are sessions, or a CSV with the columns ``object`` and ``session`` and any
-            others, as a spreadsheet writes it (commas, semicolons or tabs; UTF-8). There, a session's folder is
-            relative to the file's own.
+            others, as a spreadsheet writes it (commas, semicolons or tabs; UTF-8; decimal commas become points).
+            There, a session's folder is relative to the file's own.
         may_be_gone: whether folders of sessions may be missing by now.
 
     Raises:
@@ -54,7 +55,8 @@ def read_sessions(path: Path, may_be_gone: bool = False) -> list[Row]:
     for where, row in rows:
         name = row[OBJECT]
         if not _NAME.fullmatch(name) or len(name) > 100:
-            raise InputError(f"{where}: {shown(name)} cannot be the name of a folder; {_NAME_RULE}.")
+            rename = "rename it, or name it in a CSV" if path.is_dir() else "choose another"
+            raise InputError(f"{where}: {shown(name)} cannot be the name of a folder; {rename}: {_NAME_RULE}.")
         # Some file systems take names for the same that differ in case only.
         if name.casefold() in names:
             raise InputError(f"{where}: the object {shown(name)} comes twice; give each session a name of its own.")
@@ -104,18 +106,43 @@ def _read_table(path: Path) -> Iterator[tuple[int, Row]]:
         lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
     except csv.Error as error:
         raise InputError(f"{path}: is no table after line {reader.line_num} ({error}); save it as CSV.") from error
-    titles = lines[0][1] if lines else []
+    lines = _without_empty_columns([line for line in lines if any(line[1])])
+    titles = [_own_title(title) for title in lines[0][1]] if lines else []
     for title in (OBJECT, SESSION):
         if title not in titles:
-            raise InputError(f"{path}: has no column '{title}'; its first line names {OBJECT}, {SESSION} and others.")
+            raise InputError(
+                f"{path}: has no column '{title}' but {', '.join(titles[:6]) or 'none'}; its first line names "
+                f"{OBJECT}, {SESSION} and others."
+            )
     if "" in titles or len(set(titles)) < len(titles):
         raise InputError(f"{path}: a column has no title, or two have the same; give each a title of its own.")
     for line, cells in lines[1:]:
-        if not any(cells):
-            continue
         if len(cells) != len(titles):
-            raise InputError(
-                f"{path}, line {line}: has {len(cells)} cells and not {len(titles)}; put quotation marks around a "
-                "cell that holds the separator."
-            )
+            mend = "put quotation marks around a cell that holds the separator"
+            mend = mend if len(cells) > len(titles) else "add the cells that are missing, which may be empty"
+            raise InputError(f"{path}, line {line}: has {len(cells)} cells and not {len(titles)}; {mend}.")
+    columns = list(zip(*(cells for _, cells in lines[1:]), strict=True))
+    if reader.dialect.delimiter != ",":
+        columns = [
+            column if title in (OBJECT, SESSION, *SETTINGS) else _with_points(column)
+            for title, column in zip(titles, columns, strict=False)
+        ]
+    for (line, _), cells in zip(lines[1:], zip(*columns, strict=True), strict=True):
         yield line, dict(zip(titles, cells, strict=True))
+
+
+def _own_title(title: str) -> str:
+    """A title that means something here in lower case; one of the user's as it is."""
+    return title.lower() if title.lower() in (OBJECT, SESSION, *SETTINGS) else title
+
+
+def _without_empty_columns(lines: Sequence[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
+    """The lines without the empty cells that a spreadsheet leaves at the right of all."""
+    width = max((at + 1 for _, cells in lines for at, cell in enumerate(cells) if cell), default=0)
+    return [(line, cells[:width]) for line, cells in lines]
+
+
+def _with_points(column: Sequence[str]) -> Sequence[str]:
+    """A column of numbers with decimal points in place of commas; any other as it is."""
+    numbers = all(not cell or _DECIMAL_COMMA.fullmatch(cell) for cell in column)
+    return [cell.replace(",", ".") for cell in column] if numbers else column

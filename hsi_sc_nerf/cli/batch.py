@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import tyro
 from rich.console import Console
@@ -14,7 +16,7 @@ from rich.markup import escape
 
 from hsi_sc_nerf import batch
 from hsi_sc_nerf.batch.plan import STEPS, outdated, read_plan, unlisted, write_plan
-from hsi_sc_nerf.batch.session_list import read_sessions
+from hsi_sc_nerf.batch.session_list import Row, read_sessions
 from hsi_sc_nerf.batch.session_steps import SessionSettings
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import read_json
@@ -40,7 +42,7 @@ class BatchCommand(SessionSettings):
     output_dir: Path | None = None
     """Folder for the results: sessions.csv, objects/NAME, traits.csv and index.html."""
     dry_run: bool = False
-    """Show what would be done, and do nothing."""
+    """Show what would be done, and do and write nothing."""
     retry: bool = False
     """Try the steps again that failed."""
     gpu: bool = shutil.which("nvidia-smi") is not None
@@ -73,28 +75,58 @@ class BatchCommand(SessionSettings):
                 "with --unlock, and again."
             )
         settings = SessionSettings(**{name: getattr(self, name) for name in SessionSettings.__dataclass_fields__})
-        write_plan(out, rows, settings)
+        if self.dry_run:
+            with TemporaryDirectory() as folder:
+                kept = Path(folder) / "plan"
+                write_plan(out, rows, settings, kept)
+                self._start(out, rows, kept, _stand_in(out, Path(folder) / "out"))
+        else:
+            write_plan(out, rows, settings)
+            self._start(out, rows, out, out)
+            _show_failures(out)
+
+    def _start(self, out: Path, rows: Sequence[Row], kept: Path, directory: Path) -> None:
+        """Run Snakemake.
+
+        Args:
+            out: folder of the batch.
+            rows: its objects.
+            kept: folder of its plan.
+            directory: that Snakemake works in.
+
+        Raises:
+            InputError: Snakemake ended early.
+        """
         if left := unlisted(out, rows):
             told = ", ".join(left[:5]) + (", …" if len(left) > 5 else "")
             Console(stderr=True, highlight=False, soft_wrap=True).print(
                 f"[yellow]{escape(str(out))}: holds results that the list does not name ({escape(told)}); they stay, "
                 "and the table leaves them out."
             )
-        again = [str(path.relative_to(out.resolve())) for path in outdated(read_plan(out), self.retry)]
-        words = ["--config", f"gpu={self.gpu}", "--keep-going", "--rerun-incomplete"]
-        words += ["--rerun-triggers", "mtime", "input"]
+        again = [str(path.relative_to(out.resolve())) for path in outdated(read_plan(out, kept), self.retry)]
+        words = ["--config", f"gpu={self.gpu}", *([f"plan={kept.resolve()}", "--dry-run"] if self.dry_run else [])]
+        words += ["--keep-going", "--rerun-incomplete", "--rerun-triggers", "mtime", "input"]
         words += ["--forcerun", *again] if again else []
-        words += ["--dry-run"] if self.dry_run else []
         if not any(word.split("=")[0] in _ELSEWHERE for word in self.other_words):
             memory_mb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 10**6
             words += ["--resources", "gpu=1", f"mem_mb={memory_mb}", "--cores", "all"]
         # Last a word that takes one value: the user's may begin with the name of a rule.
-        words += ["--snakefile", str(SNAKEFILE.resolve()), "--directory", str(out)]
-        status = _snakemake([*words, *self.other_words])
-        if status != 0:
+        words += ["--snakefile", str(SNAKEFILE.resolve()), "--directory", str(directory)]
+        if _snakemake([*words, *self.other_words]) != 0:
             raise InputError(f"{out}: Snakemake ended early, see above; the same command goes on where it stopped.")
-        if not self.dry_run:
-            _show_failures(out)
+
+
+def _stand_in(out: Path, folder: Path) -> Path:
+    """Where Snakemake can look at a batch's folder without leaving its own files there: links to what lies in it.
+
+    A folder that Snakemake has worked in stands for itself, because what it keeps there tells what has changed.
+    """
+    if (out / ".snakemake").is_dir():
+        return out
+    folder.mkdir()
+    for one in out.iterdir() if out.is_dir() else ():
+        (folder / one.name).symlink_to(one.resolve())
+    return folder
 
 
 def _snakemake(words: list[str]) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -84,7 +85,7 @@ class ChangeCommand:
         library = read_library(self.library) if self.library else None
         paths = [*self.clouds, self.repeat] if self.repeat else [*self.clouds]
         files = [_file_of(path) for path in paths]
-        names = [f"{day} {_day_name(path)}" for day, path in enumerate(self.clouds, start=1)]
+        names = [f"{day} {name}" for day, name in enumerate(_day_names(self.clouds), start=1)]
         if self.repeat:
             names.append(f"repeat {_day_name(self.repeat)}")
             if files[-1].resolve() in [file.resolve() for file in files[:-1]]:
@@ -154,6 +155,16 @@ def _read(path: Path) -> SpectralCloud:
 
     with tempfile.TemporaryDirectory() as folder:
         return read_spectral_ply(export_cloud(open_run(path), Path(folder), CloudOptions(num_points=POINTS)))
+
+
+def _day_names(paths: Sequence[Path]) -> list[str]:
+    """Names of the days; where all have the same file, those of the nearest folders that differ."""
+    names = [_day_name(path) for path in paths]
+    if len(set(names)) > 1:
+        return names
+    places = [path.resolve().with_suffix("").parts for path in paths]
+    alike = next((n for n, parts in enumerate(zip(*map(reversed, places), strict=False)) if len(set(parts)) > 1), 0)
+    return [place[-1 - alike] for place in places]
 
 
 def _day_name(path: Path) -> str:

@@ -99,6 +99,11 @@ def find_index(word: str) -> SpectralIndex:
     if known := names.get(word.strip().casefold()):
         return CATALOGUE[known]
     match = _OWN.fullmatch(word)
+    if match is None and "=" in word:
+        raise InputError(
+            f"the index '{word}' is no NAME = FORMULA, nor NAME = FORMULA [LOW, HIGH]; write it like 'CRI = 1/R510 - "
+            "1/R550 [0, 15]', with a name of letters, digits and _ that begins with a letter."
+        )
     if match is None:
         raise InputError(
             f"there is no index '{word}'; choose from {', '.join(CATALOGUE)}, or give NAME = FORMULA, such as "

@@ -28,6 +28,8 @@ _OPERATORS: dict[type, Callable[..., Any]] = {
     ast.UAdd: operator.pos,
 }
 _FUNCTIONS = ("sqrt", "log10")
+_PRINTED = str.maketrans({"^": "**", "\N{MINUS SIGN}": "-", "\N{EN DASH}": "-", "\N{MULTIPLICATION SIGN}": "*"})
+"""Signs of formulas in print, which people copy."""
 _BAND = re.compile(r"R(\d{3,5})")
 
 
@@ -62,7 +64,7 @@ class SpectralIndex:
         if len(self.expression) > MAX_LETTERS:
             raise ValueError(f"it is longer than {MAX_LETTERS} characters")
         try:
-            return ast.parse(self.expression.strip().replace("^", "**"), mode="eval").body
+            return ast.parse(self.expression.strip().translate(_PRINTED), mode="eval").body
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
             raise ValueError("it is no formula") from error
 

@@ -107,17 +107,17 @@ def _measures(
     of_what: str,
     indices: Sequence[str],
     calibrated: Sequence[_Calibrated],
-) -> Iterator[tuple[str, str, Float[np.ndarray, "n"], tuple[float, float]]]:
-    """Name, meaning, values and ends of the colours of what spectra tell, of the material's where they are known."""
+) -> Iterator[tuple[str, str, Float[np.ndarray, "n"], tuple[float, float], str]]:
+    """Name, meaning, values, ends of the colours and unit of what spectra tell, the material's where it is known."""
     for index in find_indices(indices, nm):
         values = index_values(index, spectra, nm)
         drawn = index.drawn_range if index.has_range else usual_range(values)
-        yield index.name, f"{index.expression}: {index.tells}{of_what}", values, drawn
+        yield index.name, f"{index.expression}: {index.tells}{of_what}", values, drawn, ""
     for one, found in calibrated:
         for label, values in zip(one.classes or ("",), found.T, strict=True):
             drawn = (0.0, 1.0) if label else usual_range(values)
             tells = f"probability by {one.name}" if label else one.unit or "calibration"
-            yield f"{one.name} {label}".strip(), f"{tells}{of_what}", values, drawn
+            yield f"{one.name} {label}".strip(), f"{tells}{of_what}", values, drawn, "" if label else one.unit
 
 
 _Calibrated = tuple[Calibration, Float[np.ndarray, "n outputs"]]
@@ -169,8 +169,8 @@ def cloud_payload(
     nm, (analysed, of_what) = cloud.wavelengths_nm, _analysed(cloud)
     calibrated = [(one, one.predictions(one.resampled(analysed, nm), only_inside=True)) for one in calibrations]
     scalars = [
-        _scalar(name, tells, values, drawn) | {"index": True}
-        for name, tells, values, drawn in _measures(analysed, nm, of_what, indices, calibrated)
+        _scalar(name, tells, values, drawn) | {"index": True, "unit": unit}
+        for name, tells, values, drawn, unit in _measures(analysed, nm, of_what, indices, calibrated)
     ]
     of_material = set(band_property_names(cloud.wavelengths_nm, "material"))
     scalars += [

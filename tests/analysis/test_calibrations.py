@@ -112,7 +112,7 @@ def test_a_map_of_the_same_bands_is_not_resampled(fitted):
 
 def test_other_bands_are_resampled_with_the_error_of_linear_interpolation(tmp_path):
     """Between bands h apart, a line errs by a h² / 4 in the middle of a parabola a nm²; here two such bands."""
-    head = {"name": "sum", "preprocessing": ""}
+    head = {"name": "sum", "preprocessing": "", "intercept": 0}
     path = table(tmp_path / "sum.csv", head, {"wavelength_nm": [505.0, 905.0], "coefficient": [1.0, 1.0]})
     curve = 2e-6
     parabola = 0.2 + curve * (NM - 700.0) ** 2
@@ -153,22 +153,31 @@ def test_models_of_scikit_learn_as_onnx(tmp_path, capfd, model, column, rtol):
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("", "wavelength_nm that ascends"),
-        ("wavelength_nm,coefficient\n", "wavelength_nm that ascends"),
-        ("wavelength_nm,coefficient\n500,1\n400,2\n", "wavelength_nm that ascends"),
+        ("", "needs a column wavelength_nm and has none"),
+        ("X,B (Brix)\nB0,3\n400,1\n", "needs a column wavelength_nm and has x, coefficient"),
+        ("400,1\n410,2\n", "first line holds numbers and not the columns' titles"),
+        ("wavelength_nm,coefficient\n", "in ascending order"),
+        ("wavelength_nm,coefficient\n,3\n500,1\n400,2\n", "in ascending order"),
+        ("wavelength_nm,coefficient\n400,1\n410,2\nB0,3\n", "in ascending order"),
+        ("# intercept: 2\nwavelength_nm,coefficient\nB0,3\n400,1\n", "two intercepts"),
+        ("wavelength_nm,coefficient\n400,1\n", "no '# intercept:'; add the model's"),
         ("wavelength_nm,coefficient\n400,one\n", "line 2: 'one' is not a number"),
         ("wavelength_nm,coefficient\n400,0,5\n", "decimal commas there must be semicolons"),
-        ("wavelength (1/cm),coefficient\n25000,1\n", "wavelength_nm that ascends"),
+        ("wavelength (1/cm),coefficient\n25000,1\n", "needs a column wavelength_nm and has wavelength_1/cm"),
         ("wavelength_nm,coefficient\n400,1,2\n", "same number of columns"),
-        ("wavelength_nm\n400\n", "neither a column coefficient"),
-        ("wavelength_nm,coefficient\n400,\n", "has no coefficient"),
+        ("wavelength_nm,1_comps,2_comps\n400,1,2\n", "neither a column coefficient nor .* but 1_comps, 2_comps"),
+        ("# intercept: 0\nwavelength_nm,coefficient\n400,\n", "has no coefficient"),
         ("# slope: 2\nwavelength_nm,coefficient\n400,1\n", "slope is no known key"),
-        ("# error: -1\nwavelength_nm,coefficient\n400,1\n", "no finite numbers"),
+        ("# intercept: 0\n# error: -1\nwavelength_nm,coefficient\n400,1\n", "no finite numbers"),
         ("# preprocessing: blur\nwavelength_nm,coefficient\n400,1\n", "'blur' is not absorbance"),
+        ("# preprocessing: savgol 3,1,1\nwavelength_nm,coefficient\n400,1\n", "spaces between the numbers"),
         ("# preprocessing: msc\nwavelength_nm,coefficient\n400,1\n", "msc needs a column reference"),
-        ("# t2_limit: 3\nwavelength_nm,coefficient\n400,1\n", "need the columns mean, weight_1"),
-        ("# t2_limit: 3\nwavelength_nm,coefficient,mean,weight_1,loading_1\n400,1,1,1,1\n", "needs score_variances"),
-        ("# model: none.onnx\nwavelength_nm\n400\n", "none.onnx: is no ONNX model"),
+        ("# intercept: 0\n# t2_limit: 3\nwavelength_nm,coefficient\n400,1\n", "need the columns mean, weight_1"),
+        (
+            "# intercept: 0\n# t2_limit: 3\nwavelength_nm,coefficient,mean,weight_1,loading_1\n400,1,1,1,1\n",
+            "needs score_variances",
+        ),
+        ("# model: none.onnx\nwavelength_nm\n400\n", "none.onnx: is missing, but own.csv names it"),
     ],
 )
 def test_what_is_no_calibration_is_refused_in_a_sentence(tmp_path, text, why):

@@ -117,7 +117,7 @@ def test_command_writes_all_results(tmp_path, capsys):
     true = small_cloud(tmp_path / "cloud.ply")
     rows = [f"{nm},{skin},{bruise}" for nm, skin, bruise in zip(NM, *true.endmembers, strict=True)]
     (tmp_path / "library.csv").write_text("\n".join(["wavelength_nm,skin,bruise", *rows]))
-    (tmp_path / "sum.csv").write_text("# unit: %\nwavelength_nm,coefficient\n600,1\n700,1\n")
+    (tmp_path / "sum.csv").write_text("# unit: %\n# intercept: 0\nwavelength_nm,coefficient\n600,1\n700,1\n")
     # Brackets would be taken for colours of the terminal.
     output = tmp_path / "out[bold]"
     TraitsCommand(

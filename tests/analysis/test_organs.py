@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from known_fruit import BROWN, GREEN, NM, RADIUS_M, SKIN, ball, fruit, noisy, rod
 
+from hsi_sc_nerf.analysis import organs
 from hsi_sc_nerf.analysis.organs import propose_organs
+from hsi_sc_nerf.analysis.spectral_edges import Edge
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
@@ -136,6 +138,25 @@ def test_a_part_at_the_lower_edge_is_an_organ_if_it_does_not_fade_towards_its_ow
     assert (list(found) == ["body"]) == falls
     if not falls:
         assert overlap(next(where for name, where in found.items() if name != "body"), height < 1.0) > 0.9
+
+
+@pytest.mark.parametrize(("wide", "mixed"), [(0.015, True), (0.12, False)])
+def test_a_narrow_strip_at_the_lower_edge_is_mixed_however_even_it_is(wide, mixed):
+    points_m = ball(20_000, np.random.default_rng(0))
+    points_m = points_m[points_m[:, 2] > -0.5 * RADIUS_M]
+    part = (points_m[:, 2] - points_m[:, 2].min() < wide * np.ptp(points_m[:, 2])) & (points_m[:, 0] > 0.0)
+    every, features = np.ones(len(part), bool), part.astype(float)[:, None]
+    surface = organs._Surface(points_m, features, np.zeros((len(part), 1), int))
+    edge = Edge(np.zeros(len(part)), 0.0, 1.0, np.ones(1), 0.5)
+    assert organs._is_mixed_with_support(part, edge, surface, every) == mixed
+
+
+@pytest.mark.slow
+def test_a_stub_is_a_stem_and_not_a_calyx():
+    points_m, spectra, true = fruit(cap=SKIN)
+    gone = true["stem"] & (points_m[:, 2] > RADIUS_M + 0.006)
+    found = propose_organs(points_m[~gone], spectra[~gone])
+    assert list(found) == ["body", "stem"]
 
 
 @pytest.mark.slow

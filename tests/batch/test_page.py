@@ -106,6 +106,14 @@ def test_sorting_by_mouse_and_keyboard_with_missing_values_last(browser, season)
     with quiet_page(browser, season / "index.html", viewport={"width": 1300, "height": 900}) as page:
         listed = [row["object"] for row in rows_of(season)]
         assert names(page) == listed
+        # Each name stands in its own cell, not over the next one.
+        right = "(all) => all.map((one) => one.getBoundingClientRect().right)"
+        ends = zip(
+            page.locator("tbody th .object > span").evaluate_all(right),
+            page.locator("tbody th").evaluate_all(right),
+            strict=True,
+        )
+        assert all(of_name < of_cell for of_name, of_cell in ends)
         volumes = {row["object"]: float(row["volume_ml"] or "nan") for row in rows_of(season)}
         page.click("thead button:text('volume, mL')")
         up = sorted(listed[:-1], key=volumes.get)

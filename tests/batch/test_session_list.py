@@ -26,8 +26,9 @@ def table(tmp_path):
         'object,session,day\np1,a,3\np2,"b, c",\n',
         "object;session;day\r\np1;a;3\r\n;;\r\np2;b, c;\r\n",
         "\ufeffsession\tobject\tday\na\tp1\t3\nb, c\tp2\t\n",
+        "Object;SESSION;day;;\n;;;;\np1;a;3;;\np2;b, c;;;\n;;;;\n",
     ],
-    ids=["commas", "semicolons of Excel", "tabs with a byte order mark"],
+    ids=["commas", "semicolons of Excel", "tabs with a byte order mark", "capitals, and empty columns and lines"],
 )
 def test_tables_of_spreadsheets_are_read(table, content):
     path = table(content)
@@ -52,6 +53,8 @@ def test_tables_of_spreadsheets_are_read(table, content):
         ("object,session\n", "lists no sessions"),
         ("object,session,day,day\np,a,1,2\n", "two have the same"),
         ("object,session,\np,a,1\n", "has no title"),
+        ("object,session,day,note\np,a,1\n", "line 2: has 3 cells and not 4; add the cells that are missing"),
+        ("sep=;\nobject;session\np;a\n", "no column 'object' but sep="),
         ("object,session\np,a\nP,a\n", "line 3: the object 'P' comes twice"),
         ("object,session\n../p,a\n", "line 2: '../p' cannot be the name of a folder"),
         ("object,session\n,a\n", "'' cannot be the name"),
@@ -78,6 +81,12 @@ def test_tables_of_other_languages_are_read(table, tmp_path):
     assert row == {"object": "Äpfel_1", "session": str(tmp_path / "Äpfel, grün"), "day": "31.02.", "Sorte": "Boskop"}
 
 
+def test_numbers_with_decimal_commas_are_read_where_commas_do_not_separate(table):
+    """Not those of a column that holds something else as well."""
+    p, q = read_sessions(table("object;session;g;mL;plot\np;a;12,5;3;1,2\nq;b, c;;-0,5;none\n"))
+    assert [p["g"], p["mL"], p["plot"], q["g"], q["mL"]] == ["12.5", "3", "1,2", "", "-0.5"]
+
+
 def test_a_session_may_come_twice_with_other_settings(table):
     rows = read_sessions(table("object,session,preset\np,a,fast\nq,a,best\n"))
     assert [row["preset"] for row in rows] == ["fast", "best"]
@@ -85,7 +94,7 @@ def test_a_session_may_come_twice_with_other_settings(table):
 
 def test_a_folder_of_sessions_is_a_list(table, tmp_path):
     (tmp_path / "notes").mkdir()
-    with pytest.raises(InputError, match="'b, c' cannot be the name"):
+    with pytest.raises(InputError, match="'b, c' cannot be the name of a folder; rename it, or name it in a CSV"):
         read_sessions(tmp_path)
     (tmp_path / "b, c").rename(tmp_path / "b-c")
     assert [row["object"] for row in read_sessions(tmp_path)] == ["a", "b-c"]

@@ -56,6 +56,11 @@ def ran(folder):
     return lines
 
 
+def files(folder):
+    """Contents of the files but Snakemake's own."""
+    return {one: one.read_bytes() for one in folder.rglob("*") if one.is_file() and ".snakemake" not in one.parts}
+
+
 def statuses(folder):
     """Of each object the status of each step."""
     folders = sorted((folder / "out" / "objects").iterdir())
@@ -124,7 +129,7 @@ def test_six_sessions_of_which_two_fail(tmp_path, monkeypatch, capfd):
     told = do("--dry-run")
     assert "train: pepper" in told.err + told.out
     assert "total          49" in told.err + told.out
-    assert ran(tmp_path) == []
+    assert not (tmp_path / "out").exists()
 
     # Each step of each takes a second; one that is whole is enough.
     kept = tmp_path / "kept"
@@ -144,6 +149,11 @@ def test_six_sessions_of_which_two_fail(tmp_path, monkeypatch, capfd):
     do()
     assert ran(tmp_path) == []
     (tmp_path / "sessions" / "broken" / "broken").unlink()
+    before = files(tmp_path / "out")
+    told = do("--dry-run", "--preset", "best")
+    assert "train: apple" in told.err + told.out
+    assert "process: apple" not in told.err + told.out
+    assert files(tmp_path / "out") == before
     do("--retry")
     assert sorted(ran(tmp_path)) == sorted([f"broken {step}" for step in STEPS] + ["unmarked process"])
 

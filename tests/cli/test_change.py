@@ -162,3 +162,10 @@ def test_bad_input_is_one_sentence_and_nothing_is_written(clouds, tmp_path):
     with pytest.raises(InputError, match="session-std"):
         ChangeCommand((first, other), out, session_std=-1.0).main()
     assert not out.exists()
+
+
+def test_days_whose_files_have_one_name_are_named_by_their_folders(tmp_path):
+    files = [tmp_path / day / "export" / "point_cloud.ply" for day in ("mo", "fr")]
+    assert change._day_names(files) == ["mo", "fr"]
+    assert change._day_names([files[0], tmp_path / "fr.ply"]) == ["point_cloud", "fr"]
+    assert change._day_names([files[0], files[0]]) == ["point_cloud", "point_cloud"]

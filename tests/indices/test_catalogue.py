@@ -82,7 +82,9 @@ def test_without_a_name_the_usual_ones_that_the_bands_give():
     ("words", "sentence"),
     [
         (["beauty"], "there is no index 'beauty'; choose from NDVI"),
-        (["1x = R800"], "there is no index '1x = R800'"),
+        (["1x = R800"], "'1x = R800' is no NAME = FORMULA"),
+        (["my CRI = R800"], "with a name of letters, digits and _ that begins with a letter"),
+        (["x = R800 [1]"], "nor NAME = FORMULA [LOW, HIGH]"),
         (["x = R800 +"], "cannot be computed: it is no formula"),
         (["x = R800 [2, 1]"], "first end"),
         (["x = R800 [2, nan]"], "first end"),

@@ -18,6 +18,7 @@ A, B, C = R.T
         ("(R500 + R600) * -R700", -(A + B) * C),
         ("R500 - R600 - R700", A - B - C),
         ("2*R500^2 / +R600 ** 3", 2 * A**2 / B**3),
+        ("R500 \N{MINUS SIGN} R600 \N{EN DASH} 2\N{MULTIPLICATION SIGN}R700", A - B - 2 * C),
         ("sqrt(R500) - log10(R600 / R700) + 1.5e-1", np.sqrt(A) - np.log10(B / C) + 0.15),
     ],
 )

@@ -417,7 +417,7 @@ def test_the_scale_bar_is_as_long_as_it_says_and_the_page_has_its_own_colours(br
 @pytest.mark.slow
 @needs_browser
 def test_the_picture_is_saved_as_it_is_drawn(browser, report):
-    """As many pixels as the drawing has, the object's colours, and nothing behind the object."""
+    """As many pixels as the drawing has, the object's colours, nothing behind the object; scale and colour bar."""
     with opened(browser, report, viewport={"width": 700, "height": 900}) as page:
         page.select_option("select[name=shown]", "band 0")
         with page.expect_download() as download:
@@ -427,7 +427,11 @@ def test_the_picture_is_saved_as_it_is_drawn(browser, report):
         with Image.open(download.value.path()) as opened_picture:
             picture = np.asarray(opened_picture)
         height, width = drawn
-        assert picture.shape == (height, width, 4)
+        assert picture.shape[1:] == (width, 4)
+        ends = picture[height + 15, [13, -14]]
+        np.testing.assert_allclose(ends, [[68, 1, 84, 255], [253, 231, 37, 255]], atol=2)
+        length = page.locator(".scale").evaluate("scale => parseFloat(scale.style.width)")
+        assert (picture[height - 14] == [0, 0, 0, 255]).all(axis=1).sum() == pytest.approx(length, abs=2.0)
         np.testing.assert_allclose(picture[height // 4, width // 2], [253, 231, 37, 255], atol=12)
         assert picture[2, 2, 3] == 0
 

@@ -121,6 +121,7 @@ def test_calibrations_and_indices_are_of_the_material_where_it_is_known(tmp_path
             "spots sound",
             "spots spot",
         ]
+        assert [scalar["unit"] for scalar in payload[:4]] == ["", "°Brix", "", ""]
         assert [scalar["name"] for scalar in payload][4:] == list(one.extra)[20:]  # not the material's bands
 
         def values(scalar):

@@ -242,7 +242,8 @@ function start(root, cloud) {
     document.documentElement.dataset.theme = fields.theme.value;
     showRegions();
   });
-  fields.picture.addEventListener("click", () => canvas.toBlob((blob) => download(blob, "object.png")));
+  fields.picture.addEventListener("click", () => (
+    pictureOf(canvas, scale, legend, cloud.colours).toBlob((blob) => download(blob, "object.png"))));
 
   const pointers = new Map();
   let travelled = 0, line = null;

@@ -45,17 +45,17 @@ function measured(cloud, points) {
     area_cm2: points.reduce((area, point) => area + cloud.areas_cm2[point], 0),
     ...cloud.meanAndSd(points),
     areas: cloud.classifiers.map((one) => ({ ...one, areas_cm2: cloud.classAreas(one, points) })),
-    indices: indices.map(({ name, i }) => {
+    indices: indices.map(({ name, unit, i }) => {
       const values = cloud.scalar(i);
-      return { name, mean_sd: meanAndSd(Array.from(points, (point) => values[point])) };
+      return { name, unit, mean_sd: meanAndSd(Array.from(points, (point) => values[point])) };
     }),
   };
 }
 
 /** Size, indices and areas of classes of a region, in words; an index without any value is left out. */
 function wordsOf({ points, area_cm2, indices, areas }) {
-  const means = indices.filter(({ mean_sd: [mean] }) => Number.isFinite(mean)).map(({ name, mean_sd: [mean, sd] }) => (
-    `${name} ${mean.toPrecision(3)} ± ${sd.toPrecision(2)}`));
+  const means = indices.filter(({ mean_sd: [mean] }) => Number.isFinite(mean)).map(({ name, unit, mean_sd: [mean, sd] }) => (
+    `${name} ${mean.toPrecision(3)} ± ${sd.toPrecision(2)} ${unit}`.trim()));
   const classed = areas.map(({ name, classes, areas_cm2 }) => `${name}: ${[...classes, UNKNOWN].map((label, i) => (
     `${label} ${areas_cm2[i].toFixed(2)} cm²`)).join(", ")}`);
   return [`${points.length} points, ${area_cm2.toPrecision(3)} cm²`, ...means, ...classed].join("; ");
