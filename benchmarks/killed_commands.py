@@ -59,8 +59,8 @@ KILLS_IN_A_ROW = 4
 TRAINED = Path("e", "hsi-sc-nerf", "run")
 NOT_COMPARED = "events.out.tfevents"
 SPEEDS = ("num_rays_per_sec", "fps")
-# A command that still runs so long after Ctrl-C, or then ends as if nothing were, has swallowed it.
-_ENDS_S, _WAS_ENDING_S = 10.0, 1.0
+# A command that still runs so long after Ctrl-C has swallowed it, unless it had been done and takes long to end.
+_ENDS_S, _WAS_ENDING_S = 10.0, 60.0
 
 
 @dataclass(frozen=True)
@@ -208,19 +208,20 @@ def _stopped(command: Command, folder: Path, reference: Path, moment: Moment) ->
     process = start(command.words, folder)
     if not moment.comes(process, folder):
         return None
+    written, since = _state(folder), time.monotonic()
     os.killpg(process.pid, signal.SIGINT)
-    since = time.monotonic()
     try:
-        process.wait(_ENDS_S)
-        if process.returncode == 0 and time.monotonic() - since < _WAS_ENDING_S:
-            return None
+        process.wait(_WAS_ENDING_S)
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()
+    took_s = time.monotonic() - since
+    if process.returncode == 0 and _state(folder) == written:
+        return None  # all had been written
     told = (folder / "log").read_text(errors="replace")
     lines = [line for line in told.splitlines() if line.strip()]
     one_line = "Traceback" not in told and bool(lines) and "stopped" in lines[-1].lower()
-    if process.returncode in (0, -signal.SIGKILL):
+    if process.returncode == 0 or took_s > _ENDS_S:
         found["goes on"] = 1
     else:
         found["130 and one line" if process.returncode == 130 and one_line else "ends otherwise"] = 1
@@ -228,7 +229,7 @@ def _stopped(command: Command, folder: Path, reference: Path, moment: Moment) ->
     left = [path for path in _files(folder / "out") if ".partial-" in str(path) or "-writing" in str(path)]
     found["leftovers"] = len(left)
     if found["ends otherwise"] or found["goes on"] or left:
-        print(f"{command.name}, Ctrl-C at {moment}: status {process.returncode}, {left}", flush=True)
+        print(f"{command.name}, Ctrl-C at {moment}, status {process.returncode} {took_s:.0f} s later: {left}")
         print("    " + "\n    ".join(lines[-4:]), flush=True)
     return found
 
