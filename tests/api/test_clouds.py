@@ -1,4 +1,5 @@
 import os
+import signal
 
 import numpy as np
 import pytest
@@ -59,7 +60,21 @@ def test_a_file_that_cannot_be_read_to_its_end_is_one_sentence(tmp_path, monkeyp
     """As some damaged ones; nothing ever writes to this pipe."""
     pytest.importorskip("h5netcdf")
     os.mkfifo(tmp_path / "cloud.nc")
-    monkeypatch.setattr(trial_reading, "_STARTS_S", 0.2)
+    monkeypatch.setattr(trial_reading, "_STUCK_S", -4.8)
+    with pytest.raises(InputError, match=r"cloud\.nc: [^\n]*no end"):
+        read_cloud(tmp_path / "cloud.nc")
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGXCPU"), reason="the system has no limit of processor time")
+def test_a_file_that_keeps_the_processor_busy_for_ever_is_one_sentence(tmp_path, monkeypatch):
+    (tmp_path / "trial.py").write_text(
+        "import sys\nfrom hsi_sc_nerf.export.trial_reading import limit_processor_time as limit\n"
+        "limit(int(sys.argv[2]))\nwhile True: pass"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setattr(trial_reading, "__name__", "trial")
+    monkeypatch.setattr(trial_reading, "_STARTS_S", 1.0)
+    (tmp_path / "cloud.nc").write_bytes(b"")
     with pytest.raises(InputError, match=r"cloud\.nc: [^\n]*no end"):
         read_cloud(tmp_path / "cloud.nc")
 
