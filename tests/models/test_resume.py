@@ -184,13 +184,16 @@ def test_a_finished_run_has_nothing_left_to_train(tiny_dataset, tmp_path, whole)
 def test_unusable_checkpoints_are_refused_in_a_sentence_and_leave_no_run(tiny_dataset, tmp_path, whole):
     new, damaged = tmp_path / "new", tmp_path / "step-000000003.ckpt"
 
+    def begin(config):
+        """As ns-train does."""
+        config.save_config()
+        config.setup(local_rank=0, world_size=1).setup()
+
     def refuse(told):
-        """As ns-train does: the settings are written, then the trainer is set up."""
         config = copy.deepcopy(whole.config)
         config.output_dir, config.load_dir = new, tmp_path
         with pytest.raises(SystemExit, match=rf"^hsi-sc-nerf: [^\n]*{told}[^\n]*\.$"):
-            config.save_config()
-            config.setup(local_rank=0, world_size=1).setup()
+            begin(config)
         assert [path for path in new.rglob("*") if not path.is_dir() or path.name == "run"] == []
 
     refuse("holds no checkpoint; --load-dir takes")
