@@ -242,8 +242,8 @@ def main(
     """Kill and interrupt every command, and write both tables.
 
     Args:
-        kills: moments at which each command is killed.
-        presses: moments at which each command gets Ctrl-C.
+        kills: moments at which each command is killed; with 0, the table's rows stay.
+        presses: moments at which each command gets Ctrl-C; likewise.
         seed: of both.
         only: part of the names of the commands to disturb; the other rows of the tables are kept.
         keep: folder for the session and the undisturbed results; what lies there is not made again.
@@ -267,6 +267,8 @@ def main(
                 ("interrupted_commands", STOPPED, presses),
             ):
                 expected = list(moments(count, first_file_s, seconds, rng))
+                if not expected:
+                    continue
                 rng.shuffle(expected)
                 if name == "killed_commands":
                     counts = killed(command, folder, inputs / command.name, expected)

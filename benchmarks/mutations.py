@@ -65,7 +65,7 @@ def main(only: str = "", results: Path = RESULTS) -> None:
             copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
             copy(ROOT / name, package / name)  # type: ignore[operator]
         if failed(package, " ".join(sorted({test for *_, tests in chosen for test in tests.split()}))):
-            raise RuntimeError("the tests fail before anything is broken")
+            raise RuntimeError(f"the tests fail before anything is broken: {(package / 'log').read_text()[-3000:]}")
         for function, broken_by, module, old, new, tests in chosen:
             path = package / "hsi_sc_nerf" / f"{module}.py"
             text = path.read_text()

@@ -102,9 +102,8 @@ def find_checkpoint(
     Raises:
         InputError: there is none.
     """
-    if step is not None:
-        path = checkpoint_path(folder, step)
-    else:
+    path: Path | None = None if step is None else checkpoint_path(folder, step)
+    if step is None:
         path = max((found for found in folder.glob("*.ckpt") if _NAME.fullmatch(found.name)), default=None)
     if path is None or not path.is_file():
         missing = "checkpoint" if step is None else f"checkpoint of step {step}"
