@@ -20,7 +20,7 @@ from hsi_sc_nerf.fields.hash_grid import interpolate_hash_grid
 from hsi_sc_nerf.fields.occupancy_grid import OccupancyGrid, grid_over
 from hsi_sc_nerf.fields.spectral_field import CoefficientGain, SpectralField, SpectralProposalField, density_of
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, cross_matrix, look_at
-from hsi_sc_nerf.models.backgrounds import Background
+from hsi_sc_nerf.models.backgrounds import Background, interpolate_image
 from hsi_sc_nerf.models.compositing import BasisDecoder, SpectralRenderer
 from hsi_sc_nerf.models.losses import separate_distortion
 from hsi_sc_nerf.models.optimizers import with_alike_singular_values
@@ -327,10 +327,19 @@ def test_shading_far_away_on_faces_and_on_the_axis_is_finite():
     points = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [-1.0, 0.0, 0.0], [1e30, -1e30, 0.0], [0.0, 0.0, 3e38]])
     coefficients = torch.tensor([0.0, 1e-40, 1.0, -1.0, 1e30])[:, None].expand(5, 3).clone().requires_grad_()
     origins = torch.tensor([[2.0, 0.3, 0.9], [0.0, 0.0, 3.0], [1e-30, 0.0, 0.0], [1e18, 0.0, 0.0], [0.5, 0.5, 0.5]])
+    assert all(part.isfinite().all() for part in made.across_image(origins, points[:1].expand(5, 3)))
     shaded = made(coefficients, points, origins)
     assert shaded.isfinite().all()
     for gradient in torch.autograd.grad(shaded[:4].sum(), [coefficients, *made.parameters()]):
         assert gradient.isfinite().all()
+
+
+@pytest.mark.parametrize("count", [1, 3, 50])  # fewer than fit into a processor's vectors, and more
+def test_places_that_are_no_numbers_are_looked_up_somewhere(count):
+    """Where PyTorch's own look-up reads outside of its table, and may end the process."""
+    nowhere, made = torch.full((count, 3), torch.nan), shading().float()
+    assert made(torch.ones(count, 3), nowhere, nowhere).isfinite().all()
+    assert interpolate_image(random(4, 6, 3).float(), nowhere[:, :2]).isfinite().all()
 
 
 def test_a_smoothed_grid_of_one_number_is_that_number_up_to_its_sides():
