@@ -273,6 +273,20 @@ def test_a_twist_is_a_matrix_exponential(angle):
     np.testing.assert_allclose(positions[2].detach().numpy(), expected[:3, 3], atol=1e-6)
 
 
+def test_penalty_is_that_of_its_formula():
+    made = refinement("turntable", 0.1)
+    with torch.no_grad():
+        made.camera_twist.neg_()
+    twist, angles = made.twist().tolist(), made.frame_angles.tolist()
+    config = made.config
+    expected = config.trans_l2_penalty * sum(value**2 for value in twist[:3])
+    expected += config.rot_l2_penalty * sum(value**2 for value in twist[3:])
+    expected += 1e-2 * sum(value**2 for value in angles) / len(angles)
+    found = {}
+    made.get_loss_dict(found)
+    assert found["camera_opt_regularizer"].item() == pytest.approx(expected, rel=1e-9)
+
+
 @pytest.mark.parametrize("mode", ["turntable", "free-discarded"])
 @pytest.mark.parametrize("size", [0.0, 1e-30, 1e-8, 1e-2, math.pi, 1e3])
 def test_corrections_of_any_size_are_rotations_with_finite_gradients(mode, size):
@@ -334,11 +348,14 @@ def test_shading_far_away_on_faces_and_on_the_axis_is_finite():
         assert gradient.isfinite().all()
 
 
-@pytest.mark.parametrize("count", [1, 3, 50])  # fewer than fit into a processor's vectors, and more
+@pytest.mark.parametrize("count", [1, 50])  # fewer than fit into a processor's vectors, and more
 def test_places_that_are_no_numbers_are_looked_up_somewhere(count):
-    """Where PyTorch's own look-up reads outside of its table, and may end the process."""
+    """The gradient of PyTorch's look-up would be written outside of its table there, and ends the process."""
     nowhere, made = torch.full((count, 3), torch.nan), shading().float()
-    assert made(torch.ones(count, 3), nowhere, nowhere).isfinite().all()
+    shaded = made(torch.ones(count, 3), nowhere, nowhere)
+    assert shaded.isfinite().all()
+    for gradient in torch.autograd.grad(shaded.sum(), [*made.maps, *made.network.parameters()]):
+        assert gradient.isfinite().all()
     assert interpolate_image(random(4, 6, 3).float(), nowhere[:, :2]).isfinite().all()
 
 

@@ -23,6 +23,8 @@ _BYTES_PER_S = 5e6
 _STUCK_S = 300.0
 """What has not ended by then waits for something that does not come, such as the other end of a pipe."""
 _BLOCK_VALUES = 1 << 22
+_ROOM_BYTES, _LARGEST_RATIO = 1 << 27, 32
+"""Memory that reading may take: for blocks and libraries, and for each byte of the file, which may be compressed."""
 
 
 def require_readable(path: Path) -> None:
@@ -74,10 +76,20 @@ def limit_processor_time(seconds: int) -> None:
         resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))  # then SIGKILL
 
 
+def limit_memory(more_bytes: int) -> None:
+    """Let this process take so much more memory than it has; where the system tells how much that is (Linux)."""
+    with suppress(ImportError, FileNotFoundError):
+        import resource
+
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (used + more_bytes, used + more_bytes))
+
+
 def _read(path: Path) -> None:
     """Read all that a NetCDF file holds, a block at a time."""
     import h5netcdf
 
+    limit_memory(_ROOM_BYTES + _LARGEST_RATIO * path.stat().st_size)
     with h5netcdf.File(path, "r") as file:
         dict(file.attrs)
         variables = list(file.variables.values())

@@ -104,7 +104,7 @@ class CameraShading(nn.Module):
         """
         with torch.no_grad():
             normals, aside = self.across_image(origins, self.normals(positions), positions - self._axis)
-        # At NaN, grid_sample reads outside of its table.
+        # At NaN, the gradient of grid_sample is written outside of its table.
         at = (normals + self.parallax * aside).nan_to_num()[None, None]
         looked_up = [
             functional.grid_sample(values, at, mode="bilinear", padding_mode="border", align_corners=True)[0, :, 0].T
@@ -116,7 +116,7 @@ class CameraShading(nn.Module):
     def normals(self, positions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Unit normals out of the surface, object's frame, from the smoothed opacities; 0 where these are even."""
         # grid_sample counts from -1 to 1 from border to border, and the last axis first.
-        at = (2.0 * (positions - self._lower) / self._sides - 1.0).flip(-1).nan_to_num()
+        at = (2.0 * (positions - self._lower) / self._sides - 1.0).flip(-1)
         gradient = functional.grid_sample(
             self._normals, at[None, None, None], mode="bilinear", padding_mode="border", align_corners=False
         )[0, :, 0, 0].T

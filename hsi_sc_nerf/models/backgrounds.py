@@ -99,8 +99,7 @@ def interpolate_image(
     """
     lines, samples, bands = image.shape
     # grid_sample counts from -1 to 1 from border to border.
-    # At NaN it reads outside of the image.
-    x, y = positions.nan_to_num().reshape(1, 1, -1, 2).unbind(dim=-1)
+    x, y = positions.reshape(1, 1, -1, 2).unbind(dim=-1)
     grid = torch.stack([2.0 * x / samples - 1.0, 2.0 * y / lines - 1.0], dim=-1)
     spectra = functional.grid_sample(
         image.permute(2, 0, 1)[None], grid, mode="bilinear", padding_mode="border", align_corners=False
