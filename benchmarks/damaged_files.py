@@ -84,6 +84,16 @@ def damaged(content: bytes, rng: random.Random) -> bytes:
     return content
 
 
+def overwritten(content: bytes, rng: random.Random) -> bytes:
+    """Content of the same length with other bytes in one to four places."""
+    changed = bytearray(content)
+    for _ in range(rng.choice((1, 1, 1, 2, 2, 4))):
+        size = min(len(changed), rng.choice((1, 1, 2, 4, 8, 64)))
+        start = rng.randrange(len(changed) - size + 1)
+        changed[start : start + size] = rng.choice((rng.randbytes(size), b"\0" * size, b"\xff" * size))
+    return bytes(changed)
+
+
 def _damaged_bytes(content: bytes, rng: random.Random) -> bytes:
     # Headers are at the beginning, and break more.
     start = rng.randrange(min(len(content), rng.choice((64, 512, len(content) + 1))) + 1)
@@ -142,7 +152,7 @@ def run_kind(kind: Kind, inputs: int, seed: int, keep: Path | None = None) -> Ou
     rng = random.Random(f"{seed} {kind.name}")
     try:
         for number in range(inputs):
-            content = damaged(valid, rng)
+            content = (overwritten if kind.same_length else damaged)(valid, rng)
             kind.path.write_bytes(content)
             before_mb, started = _peak_mb(), _processor_s()
             said, told = _outcome(kind.read)

@@ -23,12 +23,14 @@ class Kind:
         path: a valid file, which is damaged.
         read: reads it as a command does.
         share: of all inputs, relative to others: slow readers get fewer.
+        same_length: bytes are replaced and no more, where a file that states its length is refused for another one.
     """
 
     name: str
     path: Path
     read: Callable[[], object]
     share: float = 1.0
+    same_length: bool = False
 
 
 def kinds(folder: Path) -> list[Kind]:
@@ -134,6 +136,7 @@ def kinds(folder: Path) -> list[Kind]:
         Kind("point cloud (binary PLY)", files["binary"], lambda: every_point(files["binary"]), 3.0),
         Kind("point cloud (ASCII PLY)", files["ascii"], lambda: every_point(files["ascii"]), 2.0),
         Kind("point cloud (NetCDF)", files["netcdf"], lambda: read_cloud(files["netcdf"]), 0.5),
+        Kind("point cloud (NetCDF), old", files["old"], lambda: read_cloud(files["old"]), 0.5, same_length=True),
         *(
             Kind(f"point cloud (Zarr: {at})", files["zarr"] / at, lambda: read_cloud(files["zarr"]), 0.3)
             for at in ("zarr.json", "reflectance/zarr.json", "reflectance/c/0/0")

@@ -16,9 +16,6 @@ end, which differs from run to run, is drawn again for a shorter duration.
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
-import json
 import os
 import random
 import shutil
@@ -30,17 +27,12 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import torch
 import tyro
+from left_files import differences, files_in, half_written, leftovers, state_of
 from results_table import RESULTS, write_results
 
 from hsi_sc_nerf.benchmark.steps import typed_command
-from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import read_picture
-from hsi_sc_nerf.models.checkpoints import read_checkpoint, require_whole
-from hsi_sc_nerf.models.run_settings import read_config
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
 
@@ -57,10 +49,8 @@ STOPPED = ["command", "moments", "130 and one line", "ends otherwise", "goes on"
 STEPS, RAYS = 120, 128
 KILLS_IN_A_ROW = 4
 TRAINED = Path("e", "hsi-sc-nerf", "run")
-NOT_COMPARED = "events.out.tfevents"
-SPEEDS = ("num_rays_per_sec", "fps")
-# A command that still runs so long after Ctrl-C, or then ends as if nothing were, has swallowed it.
-_ENDS_S, _WAS_ENDING_S = 10.0, 1.0
+# A command that still runs so long after Ctrl-C has swallowed it, unless it had been done and takes long to end.
+_ENDS_S, _WAS_ENDING_S = 10.0, 60.0
 
 
 @dataclass(frozen=True)
@@ -104,8 +94,8 @@ class Moment:
 
     def comes(self, process: subprocess.Popen[bytes], folder: Path) -> bool:
         """Wait for it; False if the process ended before."""
-        before = _state(folder)
-        while self.writing and process.poll() is None and _state(folder) == before:
+        before = state_of(folder)
+        while self.writing and process.poll() is None and state_of(folder) == before:
             time.sleep(0.01)
         try:
             process.wait(self.after_s)
@@ -150,7 +140,7 @@ def undisturbed(command: Command, folder: Path) -> tuple[float, float]:
     """
     started = time.monotonic()
     process = start(command.words, folder)
-    while process.poll() is None and not _files(folder / "out"):
+    while process.poll() is None and not files_in(folder / "out"):
         time.sleep(0.005)
     first_file_s = time.monotonic() - started
     if process.wait() != 0:
@@ -208,110 +198,30 @@ def _stopped(command: Command, folder: Path, reference: Path, moment: Moment) ->
     process = start(command.words, folder)
     if not moment.comes(process, folder):
         return None
+    written, since = state_of(folder), time.monotonic()
     os.killpg(process.pid, signal.SIGINT)
-    since = time.monotonic()
     try:
-        process.wait(_ENDS_S)
-        if process.returncode == 0 and time.monotonic() - since < _WAS_ENDING_S:
-            return None
+        process.wait(_WAS_ENDING_S)
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()
+    took_s = time.monotonic() - since
+    if process.returncode == 0 and state_of(folder) == written:
+        return None  # all had been written
     told = (folder / "log").read_text(errors="replace")
     lines = [line for line in told.splitlines() if line.strip()]
     one_line = "Traceback" not in told and bool(lines) and "stopped" in lines[-1].lower()
-    if process.returncode in (0, -signal.SIGKILL):
+    if process.returncode == 0 or took_s > _ENDS_S:
         found["goes on"] = 1
     else:
         found["130 and one line" if process.returncode == 130 and one_line else "ends otherwise"] = 1
     found["half-written files"] = len(half_written(folder / "out", reference / "out"))
-    left = [path for path in _files(folder / "out") if ".partial-" in str(path) or "-writing" in str(path)]
+    left = [path for path in files_in(folder / "out") if ".partial-" in str(path) or "-writing" in str(path)]
     found["leftovers"] = len(left)
     if found["ends otherwise"] or found["goes on"] or left:
-        print(f"{command.name}, Ctrl-C at {moment}: status {process.returncode}, {left}", flush=True)
+        print(f"{command.name}, Ctrl-C at {moment}, status {process.returncode} {took_s:.0f} s later: {left}")
         print("    " + "\n    ".join(lines[-4:]), flush=True)
     return found
-
-
-def half_written(folder: Path, reference: Path) -> list[Path]:
-    """Files under their final names that are not whole."""
-    return [
-        path
-        for path in _files(folder)
-        if not any(part.startswith(".partial-") or part.endswith("-writing") for part in path.parts)
-        and not _is_whole(folder / path, reference / path)
-    ]
-
-
-def _state(folder: Path) -> set[tuple[Path, int]]:
-    out = folder / "out"
-    found = set()
-    for path in _files(out):
-        with contextlib.suppress(FileNotFoundError):  # temporary ones come and go
-            found.add((path, (out / path).stat().st_mtime_ns))
-    return found
-
-
-def _is_whole(path: Path, reference: Path) -> bool:
-    if reference.is_file() and reference.read_bytes() == path.read_bytes():
-        return True
-    try:
-        if path.suffix == ".json":
-            json.loads(path.read_text())
-        elif path.suffix == ".ckpt":
-            require_whole(path)
-        elif path.name == "config.yml":
-            read_config(path)
-        else:
-            return path.suffix == ".png" and read_picture(path, 3) is not None
-    except (InputError, ValueError):
-        return False
-    return True
-
-
-def differences(reference: Path, folder: Path) -> list[Path]:
-    """Files of the reference that are missing or have other contents."""
-    return [path for path in _files(reference) if not _is_same(reference / path, folder / path)]
-
-
-def _is_same(reference: Path, found: Path) -> bool:
-    if not found.is_file():
-        return False
-    if reference.suffix == ".ckpt":
-        return _same_values(read_checkpoint(reference), read_checkpoint(found))
-    if reference.name == "config.yml":
-        one, other = (dataclasses.replace(read_config(path), load_dir=None) for path in (reference, found))
-        return bool(one == other)
-    if reference.parent.name.startswith("stage-"):
-        return _metrics(reference) == _metrics(found)
-    return reference.read_bytes() == found.read_bytes()
-
-
-def _metrics(path: Path) -> dict[str, Any]:
-    content = json.loads(path.read_text())
-    results = {key: value for key, value in content["results"].items() if not key.startswith(SPEEDS)}
-    return content | {"results": results}
-
-
-def _same_values(one: Any, other: Any) -> bool:
-    if isinstance(one, torch.Tensor):
-        return torch.equal(one, other)
-    if isinstance(one, dict):
-        return one.keys() == other.keys() and all(_same_values(one[key], other[key]) for key in one)
-    if isinstance(one, list | tuple):
-        return len(one) == len(other) and all(map(_same_values, one, other))
-    return bool(one == other)
-
-
-def leftovers(folder: Path, reference: Path) -> list[Path]:
-    """Files that the reference lacks."""
-    return sorted(set(_files(folder)) - set(_files(reference)))
-
-
-def _files(folder: Path) -> list[Path]:
-    """All files under a folder but TensorBoard's, relative to it."""
-    found = (path.relative_to(folder) for path in sorted(folder.rglob("*")) if path.is_file())
-    return [path for path in found if not path.name.startswith(NOT_COMPARED)]
 
 
 def moments(count: int, first_file_s: float, seconds: float, rng: random.Random) -> Iterator[Moment]:
@@ -332,8 +242,8 @@ def main(
     """Kill and interrupt every command, and write both tables.
 
     Args:
-        kills: moments at which each command is killed.
-        presses: moments at which each command gets Ctrl-C.
+        kills: moments at which each command is killed; with 0, the table's rows stay.
+        presses: moments at which each command gets Ctrl-C; likewise.
         seed: of both.
         only: part of the names of the commands to disturb; the other rows of the tables are kept.
         keep: folder for the session and the undisturbed results; what lies there is not made again.
@@ -357,6 +267,8 @@ def main(
                 ("interrupted_commands", STOPPED, presses),
             ):
                 expected = list(moments(count, first_file_s, seconds, rng))
+                if not expected:
+                    continue
                 rng.shuffle(expected)
                 if name == "killed_commands":
                     counts = killed(command, folder, inputs / command.name, expected)

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import h5netcdf
 import numpy as np
 import torch
 import trimesh
@@ -90,6 +91,7 @@ def write_valid_files(folder: Path) -> dict[str, Path]:
         "panel": "panel.csv",
         "binary": "cloud.ply",
         "ascii": "ascii.ply",
+        "old": "old.nc",
         "library": "library.hdr",
         "sli": "library.sli",
         "csv": "table.csv",
@@ -109,6 +111,7 @@ def write_valid_files(folder: Path) -> dict[str, Path]:
     }
     files |= {name: folder / file for name, file in others.items()}
     files |= {kind: write_cloud(folder / "cloud", stream(cloud), kind) for kind in ("netcdf", "zarr")}
+    _write_without_checksums(files["netcdf"], files["old"])
     write_spectral_ply(files["binary"], cloud, np.array([[0, 1, 2], [2, 3, 4]]))
     names = ("x", "y", "z", "nx", "ny", "nz", "scalar_400.00nm", "scalar_500.00nm")
     properties = [
@@ -163,6 +166,16 @@ def write_valid_files(folder: Path) -> dict[str, Path]:
     (folder / "run").mkdir()
     (folder / "run" / "config.yml").write_text(yaml.dump(hsi_sc_nerf.config))
     return files
+
+
+def _write_without_checksums(source: Path, path: Path) -> None:
+    """A copy of a NetCDF file in the older form of HDF5, whose headers have no checksums."""
+    with h5netcdf.File(source) as file, h5netcdf.File(path, "w", track_order=False) as copy:
+        copy.attrs.update(file.attrs)
+        copy.dimensions = {name: dimension.size for name, dimension in file.dimensions.items()}
+        for name, values in file.variables.items():
+            made = copy.create_variable(name, values.dimensions, values.dtype, data=values[...])
+            made.attrs.update(values.attrs)
 
 
 def _write_season(out: Path, session: Path) -> None:

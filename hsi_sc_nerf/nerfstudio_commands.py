@@ -13,6 +13,8 @@ from __future__ import annotations
 import sys
 import types
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from nerfstudio.configs import external_methods
@@ -21,8 +23,9 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from hsi_sc_nerf import interruption
 from hsi_sc_nerf.data.dataparser import split_frames
 from hsi_sc_nerf.errors import InputError, one_sentence
-from hsi_sc_nerf.models.checkpoints import find_checkpoint
-from hsi_sc_nerf.models.run_settings import read_config
+from hsi_sc_nerf.files import atomic_write
+from hsi_sc_nerf.models.checkpoints import find_checkpoint, require_model, require_no_others
+from hsi_sc_nerf.models.run_settings import read_config, require_method
 from hsi_sc_nerf.models.spectral_model import SpectralModelConfig
 from hsi_sc_nerf.packed.dataset import is_packed, open_packed
 
@@ -122,11 +125,12 @@ def prepare(command: Any) -> bool:
     """
     name = type(command).__name__
     path = command.load_config
-    if path.is_file() and "hsi_sc_nerf" not in path.read_text(encoding="utf-8", errors="replace"):
+    if _is_of_another_method(path):
         return False
     config = read_config(path)
     if not isinstance(config.pipeline.model, SpectralModelConfig):
         return False
+    require_method(config, path)
     if name in _REFUSED:
         raise InputError(_REFUSED[name])
     if name == "ComputePSNR" and command.output_path.suffix != ".json":
@@ -158,7 +162,11 @@ def prepare(command: Any) -> bool:
             f"{checkpoints}: there is no such folder of checkpoints, which {path} names; call the command from the "
             "folder that the run was trained from."
         )
-    find_checkpoint(checkpoints)
+    remedy = "the run has saved none, so train it again"
+    require_no_others(checkpoints)
+    require_model(find_checkpoint(checkpoints, config.load_step, remedy))
+    if name == "ComputePSNR":
+        command.output_path = _WrittenWhole(command.output_path)
     if name == "ExportTSDFMesh":
         from nerfstudio.exporter.tsdf_utils import TSDF
 
@@ -168,6 +176,22 @@ def prepare(command: Any) -> bool:
         CONSOLE.print("hsi-sc-nerf: the model predicts no normals; they are estimated from the points (open3d).")
         command.normal_method = "open3d"
     return True
+
+
+def _is_of_another_method(path: Path) -> bool:
+    """Whether a file holds settings of a run, and does not name this package."""
+    with suppress(OSError):
+        text = path.read_text(encoding="utf-8", errors="replace")
+        return "!!python/object" in text and "hsi_sc_nerf" not in text
+    return False
+
+
+class _WrittenWhole(type(Path())):  # type: ignore[misc]
+    """A path whose text is written whole or not at all."""
+
+    def write_text(self, data: str, encoding: str | None = None, *_: Any) -> int:
+        with atomic_write(Path(self)) as (temporary,):
+            return temporary.write_text(data, encoding)
 
 
 def _held_out_views(config: Any) -> int | None:

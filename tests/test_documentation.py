@@ -73,15 +73,27 @@ def test_every_test_that_a_page_names_exists():
 
 
 def test_every_hard_case_says_what_happens_and_names_a_test():
-    cases = 0
+    cases, of_functions = 0, False
     for line in (ROOT / "docs" / "validation" / "hard_cases.md").read_text(encoding="utf-8").splitlines():
-        if line.startswith("|") and not re.match(r"\| (case|---) ", line):
+        of_functions = line.startswith("|") and (of_functions or line.startswith("| function "))
+        if line.startswith("|") and not of_functions and not re.match(r"\| (case|---) ", line):
             cases += 1
             case, happens, tests = (cell.strip() for cell in line.strip("|").split(" | "))
             assert case, line
             assert happens, line
             assert re.fullmatch(r"`[a-z_/]+::test_\w+`(, `[a-z_/]+::test_\w+`)*", tests), line
     assert cases > 60
+
+
+def test_every_function_of_a_training_step_names_a_test_of_each_kind():
+    page = (ROOT / "docs" / "validation" / "hard_cases.md").read_text(encoding="utf-8")
+    _, rows = page.split("### Every function of a training step")[1].split("| --- | --- | --- | --- | --- |\n")
+    letters = set(re.findall(r"^- (\w): `[a-z_/]+::test_\w+`$", rows, re.MULTILINE))
+    table = [line.strip("| ").split(" | ") for line in rows.split("\n\n")[0].splitlines()]
+    named = {name for _, *cells in table for cell in cells for name in cell.split(", ")}
+    assert all(len(cells) == 5 for cells in table)
+    assert named - {"none", "float32"} == letters
+    assert len(table) > 15
 
 
 def test_inspect_quotes_the_committed_figures_of_views():

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-from killed_commands import Command, differences, half_written, leftovers, moments, start
+from killed_commands import Command, moments, start
+from left_files import differences, half_written, leftovers
 
 from hsi_sc_nerf.files import atomic_write, write_json
 

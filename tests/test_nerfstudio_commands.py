@@ -6,18 +6,22 @@ import inspect
 import signal
 import sys
 import types
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
 from nerfstudio.configs import external_methods
 from nerfstudio.engine.trainer import TrainerConfig
 
 from hsi_sc_nerf import nerfstudio_commands as adapter
+from hsi_sc_nerf.cli.trained_runs import ExportCommand, RenderCommand, ReportCommand
 from hsi_sc_nerf.config import hsi_sc_nerf
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.models import staged_trainer
 from hsi_sc_nerf.models.run_settings import read_config
+from hsi_sc_nerf.models.trained_run import open_run
 
 
 def command(kind, path, **options):
@@ -38,8 +42,9 @@ def ours(tmp_path):
     return path
 
 
-def with_checkpoint(config_path):
-    (config_path.parent / "nerfstudio_models" / "step-000000001.ckpt").write_bytes(b"")
+def with_checkpoint(config_path, **content):
+    state = {"step": 1, "pipeline": {}} | content
+    torch.save(state, config_path.parent / "nerfstudio_models" / "step-000000001.ckpt")
     return config_path
 
 
@@ -55,6 +60,117 @@ def test_a_run_without_a_checkpoint_is_one_sentence_and_other_methods_pass(ours,
         adapter.prepare(command("ComputePSNR", ours, output_path=Path("scores.json")))
     for kind in ("ComputePSNR", "ExportMarchingCubesMesh"):
         assert adapter.prepare(command(kind, other)) is False
+
+
+def _empty(config_path):
+    config_path.write_text("")
+
+
+def _without(line):
+    def remove(config_path):
+        lines = with_checkpoint(config_path).read_text().splitlines(keepends=True)
+        config_path.write_text("".join(one for one in lines if not one.startswith(line)))
+
+    return remove
+
+
+def _of_method(name):
+    def rename(config_path):
+        text = with_checkpoint(config_path).read_text()
+        assert "method_name: hsi-sc-nerf\n" in text
+        config_path.write_text(text.replace("method_name: hsi-sc-nerf\n", f"method_name: {name}\n"))
+
+    return rename
+
+
+def _damaged(config_path):
+    with_checkpoint(config_path)
+    checkpoint = config_path.parent / "nerfstudio_models" / "step-000000001.ckpt"
+    checkpoint.write_bytes(checkpoint.read_bytes()[:-100])
+
+
+def _with_stray_file(config_path):
+    (with_checkpoint(config_path).parent / "nerfstudio_models" / "notes.txt").write_text("good")
+
+
+def _with_other_names(config_path):
+    (config_path.parent / "nerfstudio_models" / "step-best.ckpt").write_bytes(b"")
+
+
+NO_RUNS = {
+    "no file": (lambda path: path.unlink(), "there is no such file"),
+    "empty": (_empty, "cannot be read"),
+    "no method": (_without("method_name:"), "names the method None"),
+    "list as method": (_of_method("[1]"), r"names the method \[1\]"),
+    "unknown method": (_of_method("hsi-sc-nerf-2"), "names the method 'hsi-sc-nerf-2'"),
+    "no checkpoint": (lambda path: None, "holds no checkpoint; the run has saved none"),
+    "checkpoint of another name": (
+        _with_other_names,
+        "(holds no checkpoint; the run|step-best.ckpt: is no checkpoint)",
+    ),
+    "damaged checkpoint": (_damaged, "is not a readable checkpoint"),
+    "checkpoint without a step": (lambda path: with_checkpoint(path, step=None), "is no checkpoint of a model"),
+    "checkpoint without a model": (lambda path: with_checkpoint(path, pipeline=None), "is no checkpoint of a model"),
+    "checkpoint of something else": (
+        lambda path: with_checkpoint(path, pipeline={"a": 1}),
+        "is no checkpoint of a model",
+    ),
+    "stray file": (_with_stray_file, "notes.txt: is no checkpoint, and nerfstudio takes it for one; move it"),
+}
+
+
+@pytest.mark.parametrize("case", NO_RUNS)
+def test_what_is_no_run_is_one_sentence(ours, tmp_path, case):
+    """In nerfstudio's commands, and in `open_run`, by which all of ours open a run."""
+    spoil, told = NO_RUNS[case]
+    spoil(ours)
+    before = sorted(tmp_path.rglob("*"))
+    sentence = rf"^[^\n]*{told}[^\n]*\.$"
+    for kind in ("ComputePSNR", "DatasetRender", "RunViewer"):
+        options: dict = {"output_path": Path("scores.json"), "downscale_factor": None, "rendered_output_names": None}
+        with pytest.raises(SystemExit, match=sentence):
+            adapter._adapted(lambda self: pytest.fail("it was called"))(command(kind, ours, **options))
+    if case != "stray file":  # which open_run passes by
+        with pytest.raises(InputError, match=sentence):
+            open_run(ours)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("case", ["no file", "empty", "no method", "no checkpoint"])
+def test_what_is_no_run_is_one_sentence_in_commands_of_ours(ours, tmp_path, case):
+    spoil, told = NO_RUNS[case]
+    spoil(ours)
+    before = sorted(tmp_path.rglob("*"))
+    out = tmp_path / "out"
+    for made in (ExportCommand(ours, out), RenderCommand(ours, out), ReportCommand(ours.parent)):
+        with pytest.raises(InputError, match=rf"^[^\n]*{told}[^\n]*\.$"):
+            made.main()
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("case", ["no file", "empty"])
+def test_settings_given_to_ns_train_that_are_none_are_one_sentence(ours, case):
+    NO_RUNS[case][0](ours)
+    with pytest.raises(SystemExit, match=rf"^hsi-sc-nerf: [^\n]*{NO_RUNS[case][1]}[^\n]*\.$"):
+        replace(hsi_sc_nerf.config, load_config=ours)
+
+
+def test_scores_are_written_whole_or_not_at_all(ours, tmp_path, monkeypatch):
+    made = command("ComputePSNR", with_checkpoint(ours), output_path=tmp_path / "scores.json")
+    assert adapter.prepare(made) is True
+    made.output_path.write_text("good", "utf8")
+    assert made.output_path.read_text() == "good"
+    assert made.output_path.suffix == ".json"
+
+    def cut_short(self, text, *_):
+        self.write_bytes(text[:2].encode())
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", cut_short)
+    with pytest.raises(InputError, match="free some space"):
+        made.output_path.write_text("better", "utf8")
+    assert (tmp_path / "scores.json").read_text() == "good"
+    assert list(tmp_path.glob(".*")) == []
 
 
 def test_poisson_estimates_normals_where_the_model_has_none(ours):

@@ -21,6 +21,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.capture.session import is_session
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.packed.dataset import PackedDataset, open_packed, transforms_path
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
@@ -50,6 +51,14 @@ class SpectralDataParserConfig(DataParserConfig):
     positions around the object, as nerfstudio scales scenes without bounds (the paper's preset)."""
     process: ProcessConfig = field(default_factory=ProcessConfig)
     """How to process a session."""
+
+
+class SpectralDataparserOutputs(DataparserOutputs):
+    """nerfstudio's, whose transform is written whole or not at all."""
+
+    def save_dataparser_transform(self, path: Path) -> None:
+        """Write what brings metres in the object frame into the scene: a shift, then a scale."""
+        write_json(path, {"transform": self.dataparser_transform.tolist(), "scale": float(self.dataparser_scale)})
 
 
 @dataclass
@@ -86,7 +95,7 @@ class SpectralDataParser(DataParser):
         cameras = pinhole_cameras(poses[indices], dataset.intrinsics, dataset.distortion, indices)
         transform = torch.eye(4)[:3]
         transform[:, 3] = -torch.from_numpy(centre)
-        return DataparserOutputs(
+        return SpectralDataparserOutputs(
             image_filenames=[dataset.frames[i].image_path for i in indices],
             mask_filenames=[dataset.frames[i].mask_path for i in indices],
             cameras=cameras,

@@ -104,7 +104,8 @@ class CameraShading(nn.Module):
         """
         with torch.no_grad():
             normals, aside = self.across_image(origins, self.normals(positions), positions - self._axis)
-        at = (normals + self.parallax * aside)[None, None]
+        # At NaN, the gradient of grid_sample is written outside of its table.
+        at = (normals + self.parallax * aside).nan_to_num()[None, None]
         looked_up = [
             functional.grid_sample(values, at, mode="bilinear", padding_mode="border", align_corners=True)[0, :, 0].T
             for values in self.maps

@@ -35,6 +35,8 @@ explains the views before a surface forms (docs/notes/dead_ends.md)."""
 START_DENSITIES = (40.0, 0.5)
 """Densities (per scene unit) that training begins with inside of what is taken to be solid, and outside."""
 START_STEPS, START_POINTS = 80, 8192
+LARGEST_LOG_DENSITY = 60.0
+"""Solid at any length of a sample. Beyond 88 the exponential is infinite, and not a number outside the box."""
 NIL_WEIGHT = 1e-4
 """Samples of a smaller weight get no spectrum without a GPU: most lie behind the surface or before it."""
 
@@ -108,7 +110,7 @@ class SpectralField(NerfactoField):
         hidden = hidden.view(*ray_samples.frustums.shape, hidden.shape[-1])
         # The logarithm of the density up to a constant; normals are its gradients.
         self._density_before_activation = hidden[..., :1]
-        density = self.average_init_density * trunc_exp(hidden[..., :1].to(inside)) * inside
+        density = density_of(hidden[..., :1], inside, self.average_init_density)
         self.last_density = density.detach()
         return density, hidden[..., 1:]
 
@@ -223,7 +225,7 @@ class SpectralProposalField(HashMLPDensityField):
         positions = ray_samples.frustums.get_positions().detach()
         positions, inside = _zeroed_outside(grid_positions(positions, self.aabb, self.spatial_distortion))
         before_activation = self.mlp_base(positions.view(-1, 3)).view(*ray_samples.frustums.shape, -1)
-        return self.average_init_density * trunc_exp(before_activation.to(positions)) * inside, None
+        return density_of(before_activation, inside, self.average_init_density), None
 
 
 class CoefficientGain(nn.Module):
@@ -244,6 +246,20 @@ class CoefficientGain(nn.Module):
     def forward(self, raw: Float[Tensor, "*samples rank"]) -> Float[Tensor, "*samples rank"]:
         """Coefficients from the outputs of the network."""
         return raw * self.gains
+
+
+def density_of(
+    raw: Float[Tensor, "*samples 1"], inside: Float[Tensor, "*samples 1"], average: float
+) -> Float[Tensor, "*samples 1"]:
+    """Density per scene unit from a network's output, finite for any that is a number: ``average * exp(raw)``.
+
+    Args:
+        raw: logarithm of the density over ``average``; its gradient is cut at exp(15), and 0 above
+            `LARGEST_LOG_DENSITY`.
+        inside: 1 where the density is learned, 0 where it is 0; its type is that of the result.
+        average: density of a new field.
+    """
+    return average * trunc_exp(raw.to(inside).clamp(max=LARGEST_LOG_DENSITY)) * inside
 
 
 def grid_positions(

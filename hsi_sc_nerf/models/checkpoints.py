@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import struct
 import zipfile
@@ -21,6 +22,7 @@ from hsi_sc_nerf.errors import InputError
 CHECKPOINT_KEYS = {"step", "pipeline", "optimizers", "scalers", "training"}
 """Keys of a checkpoint that a run can be resumed from."""
 _EARLIER = "take an earlier one"
+_NAME = re.compile(r"step-\d{9,}\.ckpt")
 
 
 def allow_nerfstudio_checkpoints() -> None:
@@ -87,17 +89,37 @@ def link_checkpoint(path: Path, folder: Path) -> None:
             shutil.copy2(path, temporary)
 
 
-def find_checkpoint(folder: Path, step: int | None = None) -> Path:
-    """The checkpoint of ``step`` in ``folder``, or the latest.
+def find_checkpoint(
+    folder: Path,
+    step: int | None = None,
+    remedy: str = "--load-dir takes a run's nerfstudio_models or stage folder",
+) -> Path:
+    """The checkpoint of ``step`` in ``folder``, or the latest; what has another name is none.
+
+    Args:
+        remedy: what to do if there is none, the end of the error's sentence.
 
     Raises:
         InputError: there is none.
     """
-    path = checkpoint_path(folder, step) if step is not None else max(folder.glob("step-*.ckpt"), default=None)
+    path: Path | None = None if step is None else checkpoint_path(folder, step)
+    if step is None:
+        path = max((found for found in folder.glob("*.ckpt") if _NAME.fullmatch(found.name)), default=None)
     if path is None or not path.is_file():
         missing = "checkpoint" if step is None else f"checkpoint of step {step}"
-        raise InputError(f"{folder}: holds no {missing}; --load-dir takes a run's nerfstudio_models or stage folder.")
+        raise InputError(f"{folder}: holds no {missing}; {remedy}.")
     return path
+
+
+def require_no_others(folder: Path) -> None:
+    """Refuse a folder with other files than checkpoints: nerfstudio reads the step in every file's name.
+
+    Raises:
+        InputError: there is one.
+    """
+    for path in sorted(folder.iterdir()):
+        if not _NAME.fullmatch(path.name):
+            raise InputError(f"{path}: is no checkpoint, and nerfstudio takes it for one; move it elsewhere.")
 
 
 def require_whole(path: Path) -> None:
@@ -118,17 +140,35 @@ def require_whole(path: Path) -> None:
         raise InputError(f"{path}: is not a readable checkpoint (its part {damaged} is damaged); {_EARLIER}.")
 
 
+def require_model(path: Path) -> None:
+    """Refuse a checkpoint that is damaged or holds no model, before nerfstudio fails on it.
+
+    Raises:
+        InputError: it is such a checkpoint.
+    """
+    state = _load(path, mmap=True)
+    step, model = state.get("step"), state.get("pipeline")
+    if not (isinstance(step, int) and isinstance(model, dict) and all(map(torch.is_tensor, model.values()))):
+        raise InputError(f"{path}: is no checkpoint of a model; {_EARLIER}.")
+
+
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """Read a checkpoint of the staged trainer to the CPU.
 
     Raises:
         InputError: the file is damaged, missing or no such checkpoint.
     """
-    require_whole(path)
-    try:
-        state = torch.load(path, map_location="cpu")
-    except (OSError, EOFError, RuntimeError, UnpicklingError) as error:
-        raise InputError(f"{path}: is not a readable checkpoint ({error}); {_EARLIER}.") from error
-    if not isinstance(state, dict) or not state.keys() >= CHECKPOINT_KEYS:
+    state = _load(path)
+    if not state.keys() >= CHECKPOINT_KEYS:
         raise InputError(f"{path}: is not a checkpoint that hsi-sc-nerf can continue from; train anew.")
     return state
+
+
+def _load(path: Path, mmap: bool = False) -> dict[str, Any]:
+    """The content of a checkpoint that is whole; with ``mmap``, numbers are read when they are looked at."""
+    require_whole(path)
+    try:
+        state = torch.load(path, map_location="cpu", mmap=mmap)
+    except (OSError, EOFError, RuntimeError, UnpicklingError) as error:
+        raise InputError(f"{path}: is not a readable checkpoint ({error}); {_EARLIER}.") from error
+    return state if isinstance(state, dict) else {}

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any, cast
+
+from nerfstudio.engine.trainer import TrainerConfig
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.models.checkpoints import read_checkpoint
+from hsi_sc_nerf.files import content_of
+from hsi_sc_nerf.models.checkpoints import find_checkpoint, read_checkpoint
 from hsi_sc_nerf.packed.dataset import PackedDataset
 
 MODEL_EFFECTS = ("view_dependence", "still_chamber", "pose_refinement")
@@ -42,13 +46,22 @@ def chosen_effects(setting: str, dataset: PackedDataset) -> tuple[str, ...]:
     return tuple(name for name in MODEL_EFFECTS if name in present)
 
 
-def resumed_effects(setting: str, checkpoint: Path) -> str:
-    """The setting of a run that goes on from a checkpoint: the effects that this was trained with.
+def resume_effects(config: TrainerConfig) -> Path | None:
+    """Take the effects of the checkpoint that a run goes on from into its settings; gives it, None for a new run.
 
     Raises:
-        InputError: ``setting`` asks for others, or the checkpoint cannot be read.
+        InputError: the settings ask for others, or there is no such checkpoint, or it cannot be read.
     """
-    trained = read_checkpoint(checkpoint)["training"].get("effects")
+    path = config.load_checkpoint if config.load_dir is None else find_checkpoint(config.load_dir, config.load_step)
+    if path is not None:
+        model = cast(Any, config.pipeline.model)
+        model.effects = _trained_effects(model.effects, path)
+    return path
+
+
+def _trained_effects(setting: str, checkpoint: Path) -> str:
+    with content_of(checkpoint, "state of a training", "take an earlier one"):
+        trained = read_checkpoint(checkpoint)["training"].get("effects")
     if trained is None or setting in ("auto", trained):
         return trained or setting
     raise InputError(

@@ -9,16 +9,19 @@ from __future__ import annotations
 import dataclasses
 import enum
 import importlib
+import shutil
+from contextlib import suppress
 from pathlib import Path, PurePath
 from typing import Any
 
 import yaml
 from nerfstudio.engine.trainer import TrainerConfig
 
-from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.errors import InputError, shown
 
 _PACKAGES = ("nerfstudio", "hsi_sc_nerf")
 _OPTIMIZERS = "torch.optim"
+_BEFORE_TRAINING = ("config.yml", "dataparser_transforms.json", "viewer_log_filename.txt")
 # Functions that settings name for calling them later.
 _FUNCTIONS = (
     "hsi_sc_nerf.config.pipeline_with_panel",
@@ -100,6 +103,32 @@ def read_config(load_config: Path) -> TrainerConfig:
             f"{load_config}: cannot be read; give the config.yml of a run that this version of hsi-sc-nerf trained."
         ) from reason
     return config
+
+
+def require_method(config: TrainerConfig, load_config: Path) -> None:
+    """Refuse settings that name no method, which nerfstudio looks up to open a run.
+
+    Raises:
+        InputError: there is no such method, or none is named.
+    """
+    from nerfstudio.configs.method_configs import all_methods  # which imports the plugins, and so this file
+
+    if not (isinstance(config.method_name, str) and config.method_name in all_methods):
+        raise InputError(
+            f"{load_config}: names the method {shown(config.method_name)}, which nerfstudio does not know; set "
+            "its method_name to that of the training, such as hsi-sc-nerf."
+        )
+
+
+def discard_unbegun(folder: Path) -> None:
+    """Delete the folder of a run that was refused, if all in it was written before training, and empty ones above."""
+    files = [path for path in folder.rglob("*") if not path.is_dir()]
+    if not files or any(path.parent != folder or path.name not in _BEFORE_TRAINING for path in files):
+        return
+    shutil.rmtree(folder, ignore_errors=True)
+    with suppress(OSError):  # those of the experiment and the method may hold other runs
+        for above in folder.parents[:2]:
+            above.rmdir()
 
 
 def _missing_settings(value: object) -> bool:

@@ -21,19 +21,14 @@ from rich.markup import escape
 from hsi_sc_nerf import interruption
 from hsi_sc_nerf.data.dataparser import require_data
 from hsi_sc_nerf.errors import InputError, one_sentence
-from hsi_sc_nerf.files import atomic_write, make_folder, write_json
+from hsi_sc_nerf.files import atomic_write, content_of, make_folder, write_json
 from hsi_sc_nerf.models.captured_step import CapturedSteps
-from hsi_sc_nerf.models.checkpoints import (
-    checkpoint_path,
-    find_checkpoint,
-    link_checkpoint,
-    read_checkpoint,
-    write_checkpoint,
-)
-from hsi_sc_nerf.models.chosen_effects import effects_setting, resumed_effects
+from hsi_sc_nerf.models.checkpoints import checkpoint_path, link_checkpoint, read_checkpoint, write_checkpoint
+from hsi_sc_nerf.models.chosen_effects import effects_setting, resume_effects
 from hsi_sc_nerf.models.optimizers import GuardedOptimizers
 from hsi_sc_nerf.models.pipeline import SpectralPipeline
 from hsi_sc_nerf.models.presets import Preset, apply_preset
+from hsi_sc_nerf.models.run_settings import discard_unbegun, read_config
 from hsi_sc_nerf.models.schedule import Clock, Schedule
 from hsi_sc_nerf.models.spectral_model import SpectralModel, SpectralModelConfig
 from hsi_sc_nerf.models.stages import (
@@ -85,6 +80,9 @@ class StagedTrainerConfig(TrainerConfig):
 
     def __post_init__(self) -> None:
         apply_preset(self)
+        if self.load_config is not None:  # nerfstudio reads it as soon as the options are read
+            with one_sentence():
+                read_config(self.load_config)
 
     def plan(self) -> StagePlan:
         """The stages of the run.
@@ -113,6 +111,7 @@ class StagedTrainerConfig(TrainerConfig):
         CONSOLE.log(f"Saving config to: {path}")
         with one_sentence(), interruption.one_line():
             require_data(self.pipeline.datamanager)
+            resume_effects(self)
             make_folder(path.parent)
             with atomic_write(path) as (temporary,):
                 temporary.write_text(yaml.dump(self), encoding="utf-8")
@@ -139,18 +138,23 @@ class StagedTrainer(Trainer):
         self.schedule = Schedule(self.config.plan(), clock, wait)
         self._frozen: set[str] | None = None
         self._saved_step: int | None = None
-        self._loaded: Path | None = None
         self._trained_step, self._steps_since_update = -1, 0
         self._guard, self._risen_loss = NonFiniteGuard(), RisenLossGuard()
         self._captured: CapturedSteps | None = None
         self.stop_training = False  # nerfstudio sets it when the training begins; single steps read it too
-        with one_sentence(), interruption.one_line(self._stopped):
-            if path := self._checkpoint_to_load():
-                self._model_config.effects = resumed_effects(self._model_config.effects, path)
-            super().setup(test_mode)
+        try:
+            with one_sentence(), interruption.one_line(self._stopped):
+                self._loaded = resume_effects(self.config)
+                super().setup(test_mode)
+        except SystemExit:
+            discard_unbegun(self.base_dir)
+            raise
+        self.config.load_step = None  # of this run, nerfstudio's evaluation takes it for the step to evaluate
         # Evaluation and export build what was trained, whatever becomes of the dataset.
-        self._model_config.effects = effects_setting(self._model.effects)
-        (config := self.config).save_config()
+        cast(SpectralModelConfig, (config := self.config).pipeline.model).effects = effects_setting(
+            self._model.effects
+        )
+        config.save_config()
         plain = not (config.mixed_precision or config.use_grad_scaler or config.log_gradients)
         plain = plain and config.capture_steps and not config.gradient_accumulation_steps
         if self.pipeline.device.type == "cuda" and plain:
@@ -170,10 +174,6 @@ class StagedTrainer(Trainer):
     @property
     def _model(self) -> SpectralModel:
         return cast(SpectralModel, self.pipeline.model)
-
-    @property
-    def _model_config(self) -> SpectralModelConfig:
-        return cast(SpectralModelConfig, self.config.pipeline.model)
 
     def train(self) -> None:
         """Train the remaining steps of the plan; nerfstudio would add ``max_num_iterations`` to a resumed run."""
@@ -316,7 +316,7 @@ class StagedTrainer(Trainer):
             "training": {
                 **self.schedule.state(),
                 "steps_since_update": self._steps_since_update,
-                "effects": self._model_config.effects,
+                "effects": effects_setting(self._model.effects),
             },
         }
         path = checkpoint_path(self.checkpoint_dir, step)
@@ -327,24 +327,18 @@ class StagedTrainer(Trainer):
             for older in {*self.checkpoint_dir.glob("*.ckpt")} - {path}:
                 older.unlink()
 
-    def _checkpoint_to_load(self) -> Path | None:
-        if self.config.load_dir is not None:
-            return find_checkpoint(self.config.load_dir, self.config.load_step)
-        return self.config.load_checkpoint
-
     def _load_checkpoint(self) -> None:
         """Load a checkpoint of `save_checkpoint`, with the contents of ``training``."""
-        path = self._checkpoint_to_load()
-        if path is None:
+        if (path := self._loaded) is None:
             return
         state = read_checkpoint(path)
-        self._start_step = state["step"] + 1
-        self._trained_step = state["step"]
-        self.pipeline.load_pipeline(state["pipeline"], state["step"])
-        self.optimizers.restore(state["optimizers"], path)
-        if state["scalers"]:  # empty unless training was in mixed precision
-            self.grad_scaler.load_state_dict(state["scalers"])
-        self._steps_since_update = state["training"]["steps_since_update"]
-        self.schedule.resume(state["training"], self._start_step)
-        self._loaded = path
+        with content_of(path, "state of a training", "take an earlier one"):
+            self._start_step = state["step"] + 1
+            self._trained_step = state["step"]
+            self.pipeline.load_pipeline(state["pipeline"], state["step"])
+            self.optimizers.restore(state["optimizers"], path)
+            if state["scalers"]:  # empty unless training was in mixed precision
+                self.grad_scaler.load_state_dict(state["scalers"])
+            self._steps_since_update = state["training"]["steps_since_update"]
+            self.schedule.resume(state["training"], self._start_step)
         CONSOLE.print(f"Going on from {escape(str(path))}", soft_wrap=True)

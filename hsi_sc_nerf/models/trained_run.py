@@ -13,8 +13,8 @@ from nerfstudio.engine.trainer import TrainerConfig
 
 from hsi_sc_nerf.data.datamanager import SpectralDataManager
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.models.checkpoints import find_checkpoint, require_whole
-from hsi_sc_nerf.models.run_settings import read_config
+from hsi_sc_nerf.models.checkpoints import find_checkpoint, require_model
+from hsi_sc_nerf.models.run_settings import read_config, require_method
 from hsi_sc_nerf.models.spectral_model import SpectralModel, SpectralModelConfig
 from hsi_sc_nerf.packed.dataset import PackedDataset
 
@@ -82,8 +82,16 @@ def open_run(load_config: Path) -> TrainedRun:
         raise InputError(f"{load_config}: is not a run of hsi-sc-nerf; give the config.yml of one.")
     from nerfstudio.utils.eval_utils import eval_setup  # which imports the plugins, and so this file
 
-    require_whole(find_checkpoint(_relocated(config, load_config).get_checkpoint_dir()))
-    _, pipeline, _, _ = eval_setup(load_config, update_config_callback=lambda c: _relocated(c, load_config))
+    require_method(config, load_config)
+    folder = _relocated(config, load_config).get_checkpoint_dir()
+    latest = find_checkpoint(folder, remedy="the run has saved none, so train it again")
+    require_model(latest)
+
+    def relocated(settings: TrainerConfig) -> TrainerConfig:
+        settings.load_step = int(latest.stem.removeprefix("step-"))  # nerfstudio would look at all files
+        return _relocated(settings, load_config)
+
+    _, pipeline, _, _ = eval_setup(load_config, update_config_callback=relocated)
     return TrainedRun(cast(SpectralModel, pipeline.model), cast(SpectralDataManager, pipeline.datamanager))
 
 

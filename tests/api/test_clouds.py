@@ -1,4 +1,5 @@
 import os
+import signal
 
 import numpy as np
 import pytest
@@ -59,8 +60,26 @@ def test_a_file_that_cannot_be_read_to_its_end_is_one_sentence(tmp_path, monkeyp
     """As some damaged ones; nothing ever writes to this pipe."""
     pytest.importorskip("h5netcdf")
     os.mkfifo(tmp_path / "cloud.nc")
-    monkeypatch.setattr(trial_reading, "_STARTS_S", 0.2)
+    monkeypatch.setattr(trial_reading, "_STUCK_S", -4.8)
     with pytest.raises(InputError, match=r"cloud\.nc: [^\n]*no end"):
+        read_cloud(tmp_path / "cloud.nc")
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGXCPU"), reason="the system has no limit of processor time")
+@pytest.mark.parametrize(
+    ("does", "told"),
+    [
+        ("trial.limit_processor_time(int(sys.argv[2]))\nwhile True: pass", "no end"),
+        ("trial.limit_memory(10**8)\nbytearray(10**10)", "cannot be read"),
+    ],
+)
+def test_a_file_that_takes_all_of_the_processor_or_memory_is_one_sentence(tmp_path, monkeypatch, does, told):
+    (tmp_path / "trial.py").write_text(f"import sys\nfrom hsi_sc_nerf.export import trial_reading as trial\n{does}\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setattr(trial_reading, "__name__", "trial")
+    monkeypatch.setattr(trial_reading, "_STARTS_S", 1.0)
+    (tmp_path / "cloud.nc").write_bytes(b"")
+    with pytest.raises(InputError, match=rf"cloud\.nc: [^\n]*{told}"):
         read_cloud(tmp_path / "cloud.nc")
 
 

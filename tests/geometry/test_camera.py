@@ -79,3 +79,10 @@ def test_a_rotation_about_any_axis_has_its_angle(axis, angle_deg):
     direction = np.array(axis) / np.linalg.norm(axis)
     turn[:3, :3] = Rotation.from_rotvec(np.deg2rad(angle_deg) * direction).as_matrix()
     assert rotation_angle_deg(turn @ POSE, POSE) == pytest.approx(angle_deg, rel=1.6e-8, abs=1e-12)
+
+
+def test_half_a_turn_about_any_axis_is_a_number():
+    """Rounding makes some of the chords longer than those of half a turn."""
+    axes = np.random.default_rng(0).normal(size=(500, 3))
+    turns = Rotation.from_rotvec(np.pi * axes / np.linalg.norm(axes, axis=1, keepdims=True)).as_matrix()
+    assert rotation_angle_deg(np.eye(3), turns) == pytest.approx(np.full(500, 180.0), abs=3e-6)

@@ -1,5 +1,6 @@
 """A run that is killed and resumed comes to the very weights of one that was not; stages leave their results."""
 
+import copy
 import json
 
 import pytest
@@ -8,6 +9,7 @@ from nerfstudio.configs.base_config import MachineConfig
 from small_trainer import trainer
 
 from hsi_sc_nerf.models.pipeline import SpectralPipeline
+from hsi_sc_nerf.models.run_settings import read_config
 from hsi_sc_nerf.models.stages import full_frame_stage
 
 SWITCH, STEPS = 8, 20
@@ -179,23 +181,47 @@ def test_a_finished_run_has_nothing_left_to_train(tiny_dataset, tmp_path, whole)
 
 
 @pytest.mark.slow
-def test_unusable_checkpoints_are_refused_in_a_sentence(tiny_dataset, tmp_path, whole):
-    with pytest.raises(SystemExit, match="holds no checkpoint; --load-dir takes"):
-        longer(tiny_dataset, tmp_path, load_dir=tmp_path)
-    damaged = tmp_path / "step-000000003.ckpt"
-    damaged.write_bytes(max(whole.checkpoint_dir.glob("*.ckpt")).read_bytes()[:1000])
-    with pytest.raises(SystemExit, match=r"step-000000003.ckpt: is not a readable checkpoint"):
-        longer(tiny_dataset, tmp_path, load_dir=tmp_path)
-    content = bytearray(max(whole.checkpoint_dir.glob("*.ckpt")).read_bytes())
-    content[len(content) // 2] ^= 1
-    damaged.write_bytes(content)
-    with pytest.raises(SystemExit, match=r"step-000000003.ckpt: is not a readable checkpoint"):
-        longer(tiny_dataset, tmp_path, load_dir=tmp_path)
+def test_unusable_checkpoints_are_refused_in_a_sentence_and_leave_no_run(tiny_dataset, tmp_path, whole):
+    new, damaged = tmp_path / "new", tmp_path / "step-000000003.ckpt"
+
+    def begin(config):
+        """As ns-train does."""
+        config.save_config()
+        config.setup(local_rank=0, world_size=1).setup()
+
+    def refuse(told):
+        config = copy.deepcopy(whole.config)
+        config.output_dir, config.load_dir = new, tmp_path
+        with pytest.raises(SystemExit, match=rf"^hsi-sc-nerf: [^\n]*{told}[^\n]*\.$"):
+            begin(config)
+        assert [path for path in new.rglob("*") if not path.is_dir() or path.name == "run"] == []
+
+    refuse("holds no checkpoint; --load-dir takes")
+    (tmp_path / "step-best.ckpt").write_bytes(b"")
+    refuse("holds no checkpoint; --load-dir takes")
+    good = max(whole.checkpoint_dir.glob("*.ckpt")).read_bytes()
+    flipped = bytearray(good)
+    flipped[len(good) // 2] ^= 1
+    for content in (good[:1000], flipped):
+        damaged.write_bytes(content)
+        refuse("step-000000003.ckpt: is not a readable checkpoint")
+    known = checkpoint(whole.checkpoint_dir)
     torch.save({"step": 3}, damaged)
-    with pytest.raises(SystemExit, match="is not a checkpoint that hsi-sc-nerf can continue from"):
-        longer(tiny_dataset, tmp_path, load_dir=tmp_path)
-    other = checkpoint(whole.checkpoint_dir)
-    other["pipeline"]["_model.background.correction"] = torch.zeros(2, 2, 12)
-    torch.save(other, damaged)
-    with pytest.raises(SystemExit, match="other settings of the model"):
-        longer(tiny_dataset, tmp_path, load_dir=tmp_path)
+    refuse("is not a checkpoint that hsi-sc-nerf can continue from")
+    torch.save(known | {"training": 0}, damaged)
+    refuse("step-000000003.ckpt: holds no state of a training")
+    torch.save(known | {"training": {}}, damaged)
+    refuse("step-000000003.ckpt: holds no state of a training")
+    correction = {"_model.background.correction": torch.zeros(2, 2, 12)}
+    torch.save(known | {"pipeline": known["pipeline"] | correction}, damaged)
+    refuse("other settings of the model")
+
+
+@pytest.mark.slow
+def test_a_run_that_went_on_from_a_step_is_evaluated_at_its_last(tiny_dataset, tmp_path, whole):
+    """nerfstudio's evaluation takes ``load_step`` of config.yml for the step to evaluate."""
+    step = checkpoint(whole.checkpoint_dir)["step"]
+    made = longer(tiny_dataset, tmp_path, load_dir=whole.checkpoint_dir, load_step=step)
+    assert made._start_step == step + 1
+    saved = read_config(made.base_dir / "config.yml")
+    assert (saved.load_dir, saved.load_step) == (whole.checkpoint_dir, None)
