@@ -121,14 +121,14 @@ def _read_table(path: Path) -> Iterator[tuple[int, Row]]:
             mend = "put quotation marks around a cell that holds the separator"
             mend = mend if len(cells) > len(titles) else "add the cells that are missing, which may be empty"
             raise InputError(f"{path}, line {line}: has {len(cells)} cells and not {len(titles)}; {mend}.")
-    columns = list(zip(*(cells for _, cells in lines[1:]), strict=True))
+    columns: list[Sequence[str]] = list(zip(*(cells for _, cells in lines[1:]), strict=True))
     if reader.dialect.delimiter != ",":
         columns = [
             column if title in (OBJECT, SESSION, *SETTINGS) else _with_points(column)
             for title, column in zip(titles, columns, strict=False)
         ]
-    for (line, _), cells in zip(lines[1:], zip(*columns, strict=True), strict=True):
-        yield line, dict(zip(titles, cells, strict=True))
+    for (line, _), row in zip(lines[1:], zip(*columns, strict=True), strict=True):
+        yield line, dict(zip(titles, row, strict=True))
 
 
 def _own_title(title: str) -> str:
