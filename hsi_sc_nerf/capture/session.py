@@ -1,7 +1,6 @@
 """A capture session on disk: its frames, its white tarp, and the cubes of each capture.
 
-``instrument.py`` finds the files of a SPECIM IQ or of a plain folder of ENVI pairs; ``session_info.py`` reads
-``session.json``.
+``instrument.py`` finds the files of a SPECIM IQ or of a plain folder; ``session_info.py`` reads ``session.json``.
 """
 
 from __future__ import annotations
@@ -317,9 +316,9 @@ def _consistent(frames: list[Capture], tarp: Capture | None, damaged: dict[str, 
     Raises:
         InputError: the tarp has other bands.
     """
-    kinds = [(frame.cube.shape, frame.cube.wavelengths_nm.round(1).tobytes()) for frame in frames]
     if not frames:
         return frames
+    kinds = [(frame.cube.shape, frame.cube.wavelengths_nm.round(1).tobytes()) for frame in frames]
     usual = frames[kinds.index(max(kinds, key=kinds.count))].cube
     if tarp is not None and (reason := _difference(tarp, usual, same_size=False)):
         raise InputError(f"{reason}.")

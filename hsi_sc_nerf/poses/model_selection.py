@@ -66,8 +66,7 @@ def usable(seen: MarkerObservations) -> tuple[MarkerObservations, list[RejectedM
     if len(seen) == 0:
         return seen, [], []
     count = Counter(seen.marker.tolist())
-    size_px = np.sqrt(np.median([np.ptp(c, axis=0).prod() for c in seen.corners_px]))
-    static = []
+    size_px, static = np.sqrt(np.median([np.ptp(c, axis=0).prod() for c in seen.corners_px])), []
     for marker, n in count.items():
         centres = seen.corners_px[seen.marker == marker].mean(1)
         if n >= FEWEST_FRAMES and np.ptp(centres, axis=0).max() < _STATIC_FRACTION * size_px:
