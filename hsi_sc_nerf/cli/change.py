@@ -162,9 +162,9 @@ def _day_names(paths: Sequence[Path]) -> list[str]:
     names = [_day_name(path) for path in paths]
     if len(set(names)) > 1:
         return names
-    places = [path.resolve().with_suffix("").parts for path in paths]
-    alike = next((n for n, parts in enumerate(zip(*map(reversed, places), strict=False)) if len(set(parts)) > 1), 0)
-    return [place[-1 - alike] for place in places]
+    places = [(path.parent if path.name == CONFIG else path).resolve().with_suffix("").parts for path in paths]
+    levels = zip(*map(reversed, places), strict=False)
+    return next(([*level] for level in levels if len(set(level)) > 1), names)
 
 
 def _day_name(path: Path) -> str:
