@@ -133,6 +133,8 @@ class TraitsCommand:
         check_options(self)
         if self.classes and self.library is None:
             raise InputError("--classes names spectra of a library; give it with --library.")
+        if self.propose_regions and self.piece is not None:
+            raise InputError("--propose-regions looks at clouds of one object; leave out --piece or this option.")
         require_writable(self.output_dir)
         library = read_library(self.library) if self.library else None
         if library is not None and self.classes:

@@ -7,6 +7,7 @@ from standing_sphere import RADIUS_M, STAND_M, sphere_points
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
 from hsi_sc_nerf.analysis.measurement import measure_traits
 from hsi_sc_nerf.analysis.standing_pieces import one_piece, standing_pieces
+from hsi_sc_nerf.cli.clouds import TraitsCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import SpectralCloud
 
@@ -61,3 +62,9 @@ def test_sizes_are_those_of_one_object():
         assert measured.size.volume_l == pytest.approx(volume_l, rel=0.02)
     with pytest.raises(InputError, match="--piece is 3, but the cloud holds 2; choose 1 to 2"):
         one_piece(cloud, 3, CONFIG)
+
+
+def test_organs_are_proposed_of_clouds_of_one_object(tmp_path):
+    with pytest.raises(InputError, match="leave out --piece or this option"):
+        TraitsCommand(tmp_path / "cloud.ply", tmp_path / "out", piece=1, propose_regions=True).main()
+    assert not any(tmp_path.iterdir())
