@@ -80,7 +80,7 @@ def spectrum(behind):
 def shading():
     """A shading that has learned something, of a soft ball."""
     torch.manual_seed(0)
-    made = CameraShading((9, 9, 9), -torch.ones(3), 2.0 / 9.0, 3, torch.from_numpy(POSE), torch.zeros(3))
+    made = CameraShading((9, 9, 9), -torch.ones(3), 2.0 / 9.0, 3, torch.from_numpy(POSE), torch.zeros(3), -0.5)
     places = torch.stack(torch.meshgrid(*[torch.arange(9) - 4.0] * 3, indexing="ij"), dim=-1)
     made.refresh(torch.sigmoid(3.0 - places.norm(dim=-1)))
     with torch.no_grad():
@@ -249,7 +249,7 @@ def test_shading_is_that_of_loops():
             lower = table[:, line + 1, column] * (1.0 - right) + table[:, line + 1, column + 1] * right
             features.extend(upper * (1.0 - down) + lower * down)
         *hidden, last = made.network.layers
-        features = np.array(features)
+        features = np.array([*features, float(points[i, 2] < made.base)])
         for layer in hidden:
             features = np.maximum(layer.weight.detach().numpy() @ features + layer.bias.detach().numpy(), 0.0)
         log_gain, *gloss = last.weight.detach().numpy() @ features + last.bias.detach().numpy()

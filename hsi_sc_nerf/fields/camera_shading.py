@@ -4,6 +4,9 @@ The object turns before fixed lamps and a fixed camera. How a lamp shades a poin
 there, then depends on the normal in the camera's frame, nearly alike for all points (the reflectance map of Horn,
 "Understanding image intensities", 1977). So it is one function that all views and points share. A field that sees
 the viewing direction has to learn each point's highlights from the few views that show them, and guesses the others.
+
+The object and its support (container and disc) are two bodies of different material, and each has a function of its
+own. With one for both, the lowest millimetres of the object come out too far (docs/validation/effects.md).
 """
 
 from __future__ import annotations
@@ -29,7 +32,9 @@ LARGEST_LOG_GAIN = 4.0
 class CameraShading(nn.Module):
     """Gain and gloss by the normal in the frame of a camera that stands still while the object turns.
 
-    The coefficients c of a point become ``gain * c + gloss``. Both are smooth maps of the normal, found by training.
+    The coefficients c of a point become ``gain * c + gloss``. Both are smooth maps of the normal, found by training,
+    one for the object and one for its support.
+
     The lamps and the camera are not far away, so that the same highlight is at slightly different normals on the left
     and on the right of the object: the normal is displaced in proportion to the place, by one learned number.
 
@@ -40,9 +45,10 @@ class CameraShading(nn.Module):
         channels: coefficients of a sample.
         camera_to_world: pose of a measured camera, OpenGL axes, scene units.
         axis_origin: a point of the turntable's axis, which is parallel to z, scene units.
+        base: height of the plane on which the object stands, scene units.
 
     Example:
-        >>> shading = CameraShading(grid.opacity.shape, grid.lower, grid.cell, 8, camera_to_world, axis_origin)
+        >>> shading = CameraShading(grid.opacity.shape, grid.lower, grid.cell, 8, camera_to_world, axis_origin, -0.1)
         >>> shading.refresh(grid.opacity)
         >>> shaded = shading(coefficients, positions, origins)
     """
@@ -62,8 +68,10 @@ class CameraShading(nn.Module):
         channels: int,
         camera_to_world: Float[Tensor, "4 4"],
         axis_origin: Float[Tensor, "3"],
+        base: float,
     ) -> None:
         super().__init__()
+        self.base = base
         self.register_buffer("smoothed", torch.zeros(shape))
         self.register_buffer("_normals", torch.zeros(1, 3, *shape), persistent=False)
         self.register_buffer("_lower", lower.clone(), persistent=False)
@@ -75,7 +83,7 @@ class CameraShading(nn.Module):
         )
         self.parallax = nn.Parameter(torch.zeros(()))
         self.network = MLP(
-            in_dim=MAP_CHANNELS * len(MAP_SIZES),
+            in_dim=MAP_CHANNELS * len(MAP_SIZES) + 1,
             num_layers=3,
             layer_width=HIDDEN,
             out_dim=1 + channels,
@@ -110,6 +118,7 @@ class CameraShading(nn.Module):
             functional.grid_sample(values, at, mode="bilinear", padding_mode="border", align_corners=True)[0, :, 0].T
             for values in self.maps
         ]
+        looked_up.append((positions[:, 2:] < self.base).to(at))
         log_gain, gloss = self.network(torch.cat(looked_up, dim=-1)).split([1, coefficients.shape[-1]], dim=-1)
         return coefficients * torch.exp(log_gain.clamp(-LARGEST_LOG_GAIN, LARGEST_LOG_GAIN)) + gloss
 

@@ -30,6 +30,7 @@ def build_field(
     subspace: SpectralSubspace | None,
     occupancy: OccupancyGrid | None,
     turntable: dict[str, Any],
+    base: float,
 ) -> SpectralField:
     """The spectral field, with nerfacto's settings where no other is given.
 
@@ -45,6 +46,7 @@ def build_field(
         subspace: whose coefficients the head emits; None for the direct head.
         occupancy: gives the normals; None where proposal networks place the samples.
         turntable: axis and pose of a camera, as the data parser gives them for the pose refinement.
+        base: height of the plane on which the object stands, scene units.
     """
     options: dict[str, Any] = {
         "num_levels": config.num_levels,
@@ -59,7 +61,7 @@ def build_field(
         shape: tuple[int, int, int] = tuple(occupancy.opacity.shape)  # type: ignore[assignment]
         camera, axis = (torch.from_numpy(np.asarray(turntable[key])) for key in ("camera_to_world", "axis_origin"))
         rank = len(subspace.mean_coefficients)
-        options["shading"] = CameraShading(shape, occupancy.lower, occupancy.cell, rank, camera, axis)
+        options["shading"] = CameraShading(shape, occupancy.lower, occupancy.cell, rank, camera, axis, base)
     return SpectralField(
         aabb,
         num_bands=num_bands,

@@ -177,6 +177,7 @@ class SpectralModel(NerfactoModel):
             subspace=subspace,
             occupancy=self.occupancy,
             turntable=metadata["turntable"],
+            base=float(metadata["object_box"][0, 2]),
         )
         self.camera_optimizer = config.camera_optimizer.setup(
             refine="pose_refinement" in self.effects,

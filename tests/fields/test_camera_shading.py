@@ -31,9 +31,9 @@ def ball_opacity() -> torch.Tensor:
     return torch.where(centres.norm(dim=-1) < RADIUS + 4 * CELL, opacity, -1.0)
 
 
-def shading(device="cpu", camera=None) -> CameraShading:
+def shading(device="cpu", base=-RADIUS) -> CameraShading:
     torch.manual_seed(0)
-    made = CameraShading(SHAPE, LOWER, CELL, CHANNELS, pose(20.0) if camera is None else camera, torch.zeros(3))
+    made = CameraShading(SHAPE, LOWER, CELL, CHANNELS, pose(20.0), torch.zeros(3), base)
     made.to(device).refresh(ball_opacity().to(device))
     return made
 
@@ -46,6 +46,17 @@ def test_normals_of_a_ball_point_outwards():
     points = on_ball(500)
     cos = (shading().normals(points) * points / RADIUS).sum(dim=-1)
     assert torch.rad2deg(torch.acos(cos.clamp(max=1.0))).max() < 4.0
+
+
+def test_object_and_support_have_functions_of_their_own():
+    made, points = shading(base=0.0), on_ball(200)
+    origins, coefficients = pose(50.0)[:3, 3].expand(200, 3), torch.ones(200, CHANNELS)
+    with torch.no_grad():
+        made.network.layers[-1].weight.fill_(0.1)
+        before = made(coefficients, points, origins)
+        made.network.layers[0].weight[:, -1] += 1.0
+    changed = (made(coefficients, points, origins) - before).abs().amax(dim=-1) > 1e-3
+    assert torch.equal(changed, points[:, 2] < 0.0)
 
 
 def test_a_grid_without_matter_has_no_normals_and_finite_shading():
