@@ -20,7 +20,7 @@ from hsi_sc_nerf.files import atomic_write, read_json
 
 KIND = "hsi-sc-nerf regions"
 PAGE_POINTS = 50_000
-"""Points of the cloud that a page shows, unless it is asked for others."""
+"""Points of the cloud that a page shows by default."""
 _AGAIN = "save the regions again in the report's 3D view"
 _FAR_SPACINGS = 4.0
 """A surface farther from all points than so many times their distance is not the one that they lie on."""

@@ -45,7 +45,7 @@ class Measurement:
         size: of the mesh.
         uncertainty: standard deviation of each size by its cause; empty without splits.
         traits: spectra, indices, calibrations and classes of the regions.
-        components: principal components and endmembers, if they were asked for.
+        components: principal components and endmembers; None if none were to be found.
         settings: that it was made with.
     """
 

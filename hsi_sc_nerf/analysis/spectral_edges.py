@@ -52,8 +52,8 @@ def sharpest_edge(
     """
     none = Edge(distance, 0.0, 0.0, np.zeros(features.shape[1]), 0.0)
     radii, cuts, sums = rings(distance, features, rest, largest)
-    wanted = (between[0] <= radii) & (radii <= between[1])
-    radii, cuts = radii[wanted], cuts[wanted]
+    allowed = (between[0] <= radii) & (radii <= between[1])
+    radii, cuts = radii[allowed], cuts[allowed]
     inner, outer = (sums.moments(*cuts[:, ends].T)[0] for ends in ([0, 1], [2, 3]))
     inside, outside = sums.moments(np.zeros_like(cuts[:, 1]), cuts[:, 1]), sums.moments(cuts[:, 2])
     within = (inside[1] + outside[1]) / 2.0
