@@ -34,7 +34,7 @@ COMMANDS = {
     "traits": Command("clouds", "TraitsCommand", "Measure sizes, spectra, indices and classes on a cloud."),
     "change": Command("change", "ChangeCommand", "Find what changed on an object between days, beyond noise."),
     "report": Command("trained_runs", "ReportCommand", "Write one HTML file on a trained run."),
-    "collect": Command("collect", "CollectCommand", "Write one table and one page of all objects of a batch."),
+    "collect": Command("batch", "CollectCommand", "Write one table and one page of all objects of a batch."),
     "benchmark": Command("benchmark", "BenchmarkCommand", "Compare configurations by accuracy over training time."),
 }
 """The commands, in the order in which the help lists them."""
