@@ -1,4 +1,4 @@
-"""Edges on a surface: the distance from a place at which spectra change most."""
+"""Edges on a surface: the distance from a point at which spectra change most."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def sharpest_edge(
     """The edge with the largest separation; 0 where no two rings differ by an angle that tells materials apart.
 
     Args:
-        distance: of the points from a place.
+        distance: of the points from one point.
         features: of their spectra.
         rest: points that count.
         between: least and largest radius.

@@ -162,8 +162,8 @@ def _day_names(paths: Sequence[Path]) -> list[str]:
     names = [_day_name(path) for path in paths]
     if len(set(names)) > 1:
         return names
-    places = [(path.parent if path.name == CONFIG else path).resolve().with_suffix("").parts for path in paths]
-    levels = zip(*map(reversed, places), strict=False)
+    folders = [(path.parent if path.name == CONFIG else path).resolve().with_suffix("").parts for path in paths]
+    levels = zip(*map(reversed, folders), strict=False)
     return next(([*level] for level in levels if len(set(level)) > 1), names)
 
 
