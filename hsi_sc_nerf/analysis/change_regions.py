@@ -203,11 +203,7 @@ def _connected(mesh: Mesh, inside: Bool[np.ndarray, "v"], core: Bool[np.ndarray,
 
 def _pieces(mesh: Mesh, inside: Bool[np.ndarray, "v"]) -> list[Int[np.ndarray, "piece"]]:
     """Vertices of each connected piece of a part of the surface."""
-    from trimesh.graph import connected_component_labels  # takes seconds, and the help does without it
-
-    edges = mesh.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    edges = edges[inside[edges].all(axis=1)]
-    piece = connected_component_labels(edges, node_count=len(inside))
+    piece = mesh.pieces(inside.astype(int))
     some = np.flatnonzero(inside)
     order = some[np.argsort(piece[some], kind="stable")]
     return np.split(order, np.flatnonzero(np.diff(piece[order])) + 1) if len(order) else []

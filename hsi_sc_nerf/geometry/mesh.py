@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from hsi_sc_nerf.geometry.camera import unit_vectors
 
@@ -66,6 +68,19 @@ class Mesh:
         """Sum of the outward normals of each vertex's triangles, each as long as twice the triangle's area."""
         corners, doubled = self.triangles.ravel(), np.repeat(self._doubled_normals(), 3, axis=0)
         return np.stack([np.bincount(corners, axis, len(self.vertices)) for axis in doubled.T], axis=-1)
+
+    def pieces(self, labels: Int[np.ndarray, "v"] | None = None) -> Int[np.ndarray, "v"]:
+        """Number of each vertex's connected piece, from 0.
+
+        Args:
+            labels: only edges between vertices of one label connect; all edges without it.
+        """
+        edges = self.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+        if labels is not None:
+            edges = edges[labels[edges[:, 0]] == labels[edges[:, 1]]]
+        count = len(self.vertices)
+        linked = coo_array((np.ones(len(edges), bool), edges.T), shape=(count, count))
+        return connected_components(linked, directed=False)[1]
 
     def _doubled_normals(self) -> Float[np.ndarray, "t 3"]:
         a, b, c = (self.vertices[self.triangles[:, i]] for i in range(3))
