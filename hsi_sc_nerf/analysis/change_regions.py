@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.analysis.change_noise import PATCH_M
 from hsi_sc_nerf.analysis.change_significance import Patches
+from hsi_sc_nerf.analysis.classes import SMALLEST_REGION_M2
 from hsi_sc_nerf.geometry.mesh import Mesh
 
 OUTSIDE = -1
@@ -63,7 +64,7 @@ def changed_regions(
     change: Float[np.ndarray, "v k"],
     significant: Bool[np.ndarray, "p"],
     noise: Float[np.ndarray, "k"],
-    smallest_m2: float,
+    smallest_m2: float = SMALLEST_REGION_M2,
 ) -> tuple[Int[np.ndarray, "v"], list[ChangedRegion]]:
     """Outline the areas around significant patches, finer than patches are.
 
@@ -157,7 +158,7 @@ def grown_regions(
     areas_m2: Float[np.ndarray, "v"],
     before: Bool[np.ndarray, "v"],
     after: Bool[np.ndarray, "v"],
-    smallest_m2: float,
+    smallest_m2: float = SMALLEST_REGION_M2,
 ) -> list[GrownRegion]:
     """Areas of the regions that have a property before or after; what overlaps is one region. The largest first.
 

@@ -13,6 +13,8 @@ from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.numerics import spectral_angle
 
 UNCLASSIFIED = -1
+SMALLEST_REGION_M2 = 5e-6
+"""Smaller connected regions are not listed; their area still counts."""
 _CHUNK_SPECTRA = 1 << 12
 
 

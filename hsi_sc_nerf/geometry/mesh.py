@@ -43,6 +43,11 @@ class Mesh:
         """Area of each triangle."""
         return np.linalg.norm(self._doubled_normals(), axis=1) / 2.0
 
+    def vertex_areas_m2(self) -> Float[np.ndarray, "v"]:
+        """Surface area of each vertex: a third of each of its triangles. The areas add up to the mesh's area."""
+        thirds = np.repeat(self.triangle_areas_m2() / 3.0, 3)
+        return np.bincount(self.triangles.ravel(), thirds, minlength=len(self.vertices))
+
     def volume_m3(self) -> float:
         """Enclosed volume of a closed mesh (divergence theorem)."""
         first = self.vertices[self.triangles[:, 0]]
