@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from hsi_sc_nerf.geometry.camera import unit_vectors
 
@@ -80,12 +78,12 @@ class Mesh:
         Args:
             labels: only edges between vertices of one label connect; all edges without it.
         """
+        from trimesh.graph import connected_component_labels  # takes seconds, and the help does without it
+
         edges = self.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
         if labels is not None:
             edges = edges[labels[edges[:, 0]] == labels[edges[:, 1]]]
-        count = len(self.vertices)
-        linked = coo_array((np.ones(len(edges), bool), edges.T), shape=(count, count))
-        return connected_components(linked, directed=False)[1]
+        return connected_component_labels(edges, node_count=len(self.vertices))
 
     def _doubled_normals(self) -> Float[np.ndarray, "t 3"]:
         a, b, c = (self.vertices[self.triangles[:, i]] for i in range(3))
