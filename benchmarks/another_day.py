@@ -21,6 +21,8 @@ STAND_M = 0.07
 """Height of the container."""
 BASE_M = 0.006
 """Height of what counts as the base."""
+BRUISED = 0.45
+"""Half of the largest fraction of bruise: where its outline is."""
 _SMOOTH_SD = 0.7
 """Standard deviation of `smooth_noise`."""
 
@@ -81,6 +83,12 @@ def fruit_of(
     weights = fruit_weights(shape, fruit, rng)
     spectra = endmembers(FRUIT_MATERIALS[kind], wavelengths_nm, dried_materials(day, kind))
     return TrueObject(FRUIT_MATERIALS[kind], shape.mesh, weights, spectra, wavelengths_nm)
+
+
+def bruise_cm2(fruit: TrueObject) -> float:
+    """True area of the bruise."""
+    bruised = fruit.weights[:, fruit.materials.index("bruise")] > BRUISED
+    return float(1e4 * fruit.mesh.vertex_areas_m2()[bruised].sum())
 
 
 def dried_materials(day: SetDown, kind: Literal["apple", "pear"]) -> dict[str, Material]:

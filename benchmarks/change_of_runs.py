@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from another_day import STAND_M, SetDown, dried_materials, fruit_of, set_down
-from change_over_time import AGAIN, GROWN, MESH, NEAR_M, SESSION_SD, SMALLEST_M2, beside, bruise_cm2
+from another_day import STAND_M, SetDown, bruise_cm2, dried_materials, fruit_of, set_down
+from change_over_time import AGAIN, GROWN, MESH, NEAR_M, SESSION_SD, beside
 from results_table import RESULTS, write_results
 from rich.progress import track
 from scipy.spatial import cKDTree
@@ -78,7 +78,7 @@ class ChangeOfRuns:
         # Without --repeat, that capture of the first day is a day as well.
         for given in (None, *(day for day in later if day.name == REPEAT)):
             days = [first, *(day for day in later if day is not given)]
-            found = compare_days(days, (), indices, SESSION_SD, SMALLEST_M2, repeat=given)
+            found = compare_days(days, (), indices, SESSION_SD, repeat=given)
             rows += [_row(fruit, one, given) for one in found]
         return rows
 

@@ -15,7 +15,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 import tyro
-from another_day import CloudErrors, SetDown, cloud_of, fruit_of, set_down
+from another_day import CloudErrors, SetDown, bruise_cm2, cloud_of, fruit_of, set_down
 from results_table import RESULTS, write_results
 from rich.progress import track
 from scipy.spatial import cKDTree
@@ -40,9 +40,7 @@ from hsi_sc_nerf.simulate.mesh import sphere
 
 NM = np.linspace(400.0, 1000.0, 25)
 MESH = MeshConfig(octree_depth=7)
-SMALLEST_M2, SESSION_SD = 5e-6, 0.01
-BRUISED = 0.45
-"""Half of the largest fraction of bruise: where its outline is."""
+SESSION_SD = 0.01
 WATER = CATALOGUE["WI"]
 SKINS = 4
 """Materials of the library: skin, blush, lenticel, bruise; the stem's spectrum lies between two of them."""
@@ -109,9 +107,7 @@ class ChangeOverTime:
         on_mesh = days_on_one_mesh(clouds, [str(number) for number in range(len(days))], MESH, MAX_INCIDENCE_DEG)
         library = SpectralLibrary(first.materials[:SKINS], NM, first.endmembers[:SKINS])
         # Each day beside the first one; what grew since the day before plays no part here.
-        compared = compare_days(
-            on_mesh, (), find_indices((), NM), SESSION_SD, SMALLEST_M2, library, CLASSIFICATION_ANGLE_RAD
-        )
+        compared = compare_days(on_mesh, (), find_indices((), NM), SESSION_SD, library, CLASSIFICATION_ANGLE_RAD)
         found = list(track(compared, f"Comparing {kind}s", total=len(later)))
         table = zip(SERIES[kind], later, found, strict=True)
         return [_row(kind, name, day, first, fruit, one) for (name, day, _), fruit, one in table]
@@ -135,7 +131,7 @@ def _draw(path: Path, points: int) -> None:
     last = SERIES["apple"][-1][1]
     clouds = [cloud_of(fruit_of(day, NM), day, CloudErrors(), points, seed) for seed, day in enumerate((FIRST, last))]
     first, later = days_on_one_mesh(clouds, ["first", "last"], MeshConfig(), MAX_INCIDENCE_DEG)
-    (found,) = compare_days([first, later], (), (), SESSION_SD, SMALLEST_M2)
+    (found,) = compare_days([first, later], (), (), SESSION_SD)
     draw_change(path, first, found, found.quantities[BRIGHTNESS], SideViews(first.surface.mesh))
 
 
@@ -177,24 +173,14 @@ def beside(found: float, true: float) -> str:
     return f"{found:.2f} ({100 * (found / true - 1):+.0f} %)"
 
 
-def bruise_cm2(fruit: TrueObject) -> float:
-    """True area of the bruise."""
-    return float(1e4 * _areas_m2(fruit)[fruit.weights[:, fruit.materials.index("bruise")] > BRUISED].sum())
-
-
 def _water_change(first: TrueObject, now: TrueObject) -> float:
     """Median over the surface."""
-    areas_m2 = _areas_m2(first)
+    areas_m2 = first.mesh.vertex_areas_m2()
     drawn = np.random.default_rng(0).choice(len(areas_m2), 20_000, p=areas_m2 / areas_m2.sum())
     before, after = (
         index_values(WATER, one.weights[drawn] @ one.endmembers, one.wavelengths_nm) for one in (first, now)
     )
     return float(np.median(after - before))
-
-
-def _areas_m2(fruit: TrueObject) -> np.ndarray:
-    thirds = np.repeat(fruit.mesh.triangle_areas_m2() / 3.0, 3)
-    return np.bincount(fruit.mesh.triangles.ravel(), thirds, minlength=len(fruit.weights))
 
 
 if __name__ == "__main__":

@@ -228,7 +228,7 @@ def main(
     Args:
         inputs: of all kinds together.
         seed: of the damages.
-        only: part of the names of the kinds to run, each with its share of inputs; the table's other rows are kept.
+        only: part of the names of the kinds to run, each with its fraction of inputs; other rows are kept.
         keep: folder for inputs that were neither refused nor read in time and memory.
         results: folder of the table.
     """
@@ -240,10 +240,10 @@ def main(
             kind.read()
         used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (used + ROOM_BYTES, resource.RLIM_INFINITY))
-        shares, rows = sum(kind.share for kind in every_kind), []
+        weights, rows = sum(kind.weight for kind in every_kind), []
         for kind in found:
             started = time.monotonic()
-            outcome = run_kind(kind, round(inputs * kind.share / shares), seed, keep)
+            outcome = run_kind(kind, round(inputs * kind.weight / weights), seed, keep)
             rows.append(outcome.row(kind.name))
             print(f"{kind.name}: {time.monotonic() - started:.0f} s, {dict(outcome.counts)}", flush=True)
             for told, count in outcome.errors.most_common(12):

@@ -26,7 +26,7 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 from results_table import RESULTS, SOURCE_COLUMNS, read_results
 
-from hsi_sc_nerf.cli.commands import COMMANDS, command_line, named_commands
+from hsi_sc_nerf.cli.main import COMMANDS, command_line, named_commands
 from hsi_sc_nerf.indices.catalogue import CATALOGUE
 from hsi_sc_nerf.terminal import markdown_table
 

@@ -1,9 +1,9 @@
-"""The effects that sessions are found to call for, and what simulating them or leaving them out costs.
+"""Effects found in sessions, and what modelling them or leaving them out costs.
 
     uv run python benchmarks/effects.py --output-dir /tmp/effects
     uv run python benchmarks/effects.py --output-dir /tmp/effects --parts decisions
 
-Decisions: sessions with each effect, from clear to below the noise, and without it. Models: scenes that call for one
+Decisions: sessions with each effect, from clear to below the noise, and without it. Models: scenes that have one
 effect of the model, or for none, trained with what is decided, with everything, and without the effect; held-out
 views are compared with noise-free ones.
 """

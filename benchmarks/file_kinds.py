@@ -22,14 +22,14 @@ class Kind:
         name: in the table.
         path: a valid file, which is damaged.
         read: reads it as a command does.
-        share: of all inputs, relative to others: slow readers get fewer.
+        weight: fraction of all inputs, relative to others: slow readers get fewer.
         same_length: bytes are replaced and no more, where a file that states its length is refused for another one.
     """
 
     name: str
     path: Path
     read: Callable[[], object]
-    share: float = 1.0
+    weight: float = 1.0
     same_length: bool = False
 
 

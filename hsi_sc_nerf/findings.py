@@ -1,7 +1,7 @@
 """What was found of a session.
 
-A finding of a check has a level, one sentence, and the figures behind it. An effect that a session calls for, or not,
-is decided by its evidence (docs/validation/effects.md).
+A finding of a check has a level, one sentence, and the figures behind it. Whether a session has an effect is decided
+by its evidence (docs/validation/effects.md).
 """
 
 from __future__ import annotations

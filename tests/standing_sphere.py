@@ -7,7 +7,7 @@ STAND_M = 0.07
 
 
 def sphere_points(count, seed=0, noise_m=0.0, above=-1.0):
-    """Even on a sphere that stands at z = 0.07; its lower part, below a share of the radius, is not seen."""
+    """Even on a sphere that stands at z = 0.07; its lower part, below a fraction of the radius, is not seen."""
     rng = np.random.default_rng(seed)
     normals = rng.standard_normal((count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)

@@ -16,7 +16,7 @@ import torch
 import tyro
 from random_cloud import random_cloud
 
-from hsi_sc_nerf.cli.commands import command_line
+from hsi_sc_nerf.cli.main import command_line
 from hsi_sc_nerf.export.cloud import read_spectral_ply, stream
 from hsi_sc_nerf.export.formats import write_cloud
 

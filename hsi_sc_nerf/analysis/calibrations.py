@@ -146,14 +146,14 @@ class Calibration:
             InputError: its own reach beyond.
         """
         nearest = nm[nearest_bands(nm, self.wavelengths_nm)]
-        wanted = np.where(np.abs(nearest - self.wavelengths_nm) <= _SAME_BAND_NM, nearest, self.wavelengths_nm)
-        if wanted.min() < nm.min() or wanted.max() > nm.max():
+        needed = np.where(np.abs(nearest - self.wavelengths_nm) <= _SAME_BAND_NM, nearest, self.wavelengths_nm)
+        if needed.min() < nm.min() or needed.max() > nm.max():
             raise InputError(
-                f"the calibration {self.name} needs {wanted.min():g} to {wanted.max():g} nm, and the cloud has "
+                f"the calibration {self.name} needs {needed.min():g} to {needed.max():g} nm, and the cloud has "
                 f"{nm.min():g} to {nm.max():g} nm; give a cloud with more bands, or a calibration that needs fewer."
             )
         order = np.argsort(nm)
-        return np.stack([np.interp(wanted, nm[order], row[order]) for row in np.eye(len(nm))])
+        return np.stack([np.interp(needed, nm[order], row[order]) for row in np.eye(len(nm))])
 
     def coarser(self, nm: Float[np.ndarray, "others"]) -> Int[np.ndarray, "half"] | None:
         """Every second of the bands ``nm``, and the last; None where its own are among them.
@@ -303,7 +303,7 @@ def _onnx_model(table: Path, name: str, bands: int, columns: slice) -> Callable[
         import onnxruntime
     except ImportError as error:
         raise InputError(f"{name} needs onnxruntime; install it: pip install 'hsi-sc-nerf[calibrations]'.") from error
-    path, wanted = table.with_name(Path(name).name), columns.stop - columns.start
+    path, expected = table.with_name(Path(name).name), columns.stop - columns.start
     if not path.is_file():
         raise InputError(f"{path}: is missing, but {table.name} names it; put the model beside the table.")
     try:
@@ -320,11 +320,11 @@ def _onnx_model(table: Path, name: str, bands: int, columns: slice) -> Callable[
             (found,) = session.run([gives], {takes.name: spectra.astype(kind)})
             return np.asarray(found, float).reshape(len(spectra), -1)[:, columns]
 
-        if (given := predict(np.zeros((2, bands))).shape[1]) != wanted:
-            raise ValueError(f"it gives {given} of {wanted}")
+        if (given := predict(np.zeros((2, bands))).shape[1]) != expected:
+            raise ValueError(f"it gives {given} of {expected}")
     except Exception as error:  # onnxruntime's exceptions have no common class
         raise InputError(
-            f"{path}: is no ONNX model of spectra of {bands} bands whose last output has {wanted} columns from "
+            f"{path}: is no ONNX model of spectra of {bands} bands whose last output has {expected} columns from "
             f"column {columns.start} on ({error}); {_REMEDY}."
         ) from error
     return predict

@@ -44,7 +44,6 @@ def compare_days(
     bands_nm: Sequence[float],
     indices: Sequence[SpectralIndex],
     session_sd: float,
-    smallest_m2: float,
     library: SpectralLibrary | None = None,
     angle_rad: float = np.inf,
     repeat: Day | None = None,
@@ -56,7 +55,6 @@ def compare_days(
         bands_nm: wavelengths whose reflectance is compared.
         indices: that are compared.
         session_sd: `hsi_sc_nerf.analysis.change_maps.changes`.
-        smallest_m2: smaller regions are left out.
         library: spectra to classify the surface by.
         angle_rad: largest spectral angle of a class.
         repeat: another capture of the first day, `hsi_sc_nerf.analysis.change_maps.changes`.
@@ -66,17 +64,17 @@ def compare_days(
     """
     first, earlier = days[0], None
     mesh, areas_m2 = first.surface.mesh, first.surface.areas_m2
-    at_first = None if library is None else classified(first.surface, library, angle_rad, smallest_m2)
+    at_first = None if library is None else classified(first.surface, library, angle_rad)
     for before, after in pairwise(days):
-        quantities = changes(first, after, bands_nm, indices, session_sd, smallest_m2, repeat)
+        quantities = changes(first, after, bands_nm, indices, session_sd, repeat)
         grown = {}
         for name, quantity in quantities.items():
             then = np.zeros_like(quantity.changed) if earlier is None else earlier[name].changed
-            grown[name] = grown_regions(mesh, areas_m2, then, quantity.changed, smallest_m2)
+            grown[name] = grown_regions(mesh, areas_m2, then, quantity.changed)
         classes = {}
         if library is not None and at_first is not None:
-            now = classified(after.surface, library, angle_rad, smallest_m2)
-            classes = _class_regions(first, at_first, now, _beyond_noise(quantities), areas_m2, smallest_m2)
+            now = classified(after.surface, library, angle_rad)
+            classes = _class_regions(first, at_first, now, _beyond_noise(quantities), areas_m2)
         yield Comparison(first.name, after, quantities, before.name, grown, classes)
         earlier = quantities
 
@@ -93,11 +91,10 @@ def _class_regions(
     after: Classes,
     beyond_noise: Bool[np.ndarray, "v"],
     areas_m2: Float[np.ndarray, "v"],
-    smallest_m2: float,
 ) -> dict[str, list[GrownRegion]]:
     regions = {}
     for number, name in enumerate(before.names):
         was = before.mixture_labels == number
         became = np.where(beyond_noise, after.mixture_labels == number, was)
-        regions[name] = grown_regions(first.surface.mesh, areas_m2, was, became, smallest_m2)
+        regions[name] = grown_regions(first.surface.mesh, areas_m2, was, became)
     return regions

@@ -73,7 +73,6 @@ def changes(
     bands_nm: Sequence[float],
     indices: Sequence[SpectralIndex],
     session_sd: float,
-    smallest_m2: float,
     repeat: Day | None = None,
 ) -> dict[str, Quantity]:
     """The change of each quantity from one day to another, tested patch by patch, by name.
@@ -85,7 +84,6 @@ def changes(
         indices: that are compared.
         session_sd: relative standard deviation of the reflectance that the white references of two sessions make
             alike for the whole surface, as a level and as a slope over the bands.
-        smallest_m2: smaller regions are left out.
         repeat: another capture of the day before, on the same mesh. What is no larger than between these two is no
             change.
 
@@ -132,9 +130,7 @@ def changes(
         test = significance(of_patches, patches.centres_m, off, shared, conditions, errors, at_rim, quantities)
         p = np.where(seen, test.p[patches.of_vertex], 1.0)
         beyond, significant = last - first - test.whole, test.p < FALSE_DISCOVERIES
-        region, regions = changed_regions(
-            one.mesh, one.areas_m2, patches, first, beyond, significant, test.noise, smallest_m2
-        )
+        region, regions = changed_regions(one.mesh, one.areas_m2, patches, first, beyond, significant, test.noise)
         change = (last - first)[:, 0] if shown is None else np.where(seen, shown, np.nan)
         return Quantity(name, unit, change, p, test, region, regions)
 

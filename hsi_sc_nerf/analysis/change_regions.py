@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.analysis.change_noise import PATCH_M
 from hsi_sc_nerf.analysis.change_significance import Patches
+from hsi_sc_nerf.analysis.classes import SMALLEST_REGION_M2
 from hsi_sc_nerf.geometry.mesh import Mesh
 
 OUTSIDE = -1
@@ -63,7 +64,7 @@ def changed_regions(
     change: Float[np.ndarray, "v k"],
     significant: Bool[np.ndarray, "p"],
     noise: Float[np.ndarray, "k"],
-    smallest_m2: float,
+    smallest_m2: float = SMALLEST_REGION_M2,
 ) -> tuple[Int[np.ndarray, "v"], list[ChangedRegion]]:
     """Outline the areas around significant patches, finer than patches are.
 
@@ -157,7 +158,7 @@ def grown_regions(
     areas_m2: Float[np.ndarray, "v"],
     before: Bool[np.ndarray, "v"],
     after: Bool[np.ndarray, "v"],
-    smallest_m2: float,
+    smallest_m2: float = SMALLEST_REGION_M2,
 ) -> list[GrownRegion]:
     """Areas of the regions that have a property before or after; what overlaps is one region. The largest first.
 
@@ -203,11 +204,7 @@ def _connected(mesh: Mesh, inside: Bool[np.ndarray, "v"], core: Bool[np.ndarray,
 
 def _pieces(mesh: Mesh, inside: Bool[np.ndarray, "v"]) -> list[Int[np.ndarray, "piece"]]:
     """Vertices of each connected piece of a part of the surface."""
-    from trimesh.graph import connected_component_labels  # takes seconds, and the help does without it
-
-    edges = mesh.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    edges = edges[inside[edges].all(axis=1)]
-    piece = connected_component_labels(edges, node_count=len(inside))
+    piece = mesh.pieces(inside.astype(int))
     some = np.flatnonzero(inside)
     order = some[np.argsort(piece[some], kind="stable")]
     return np.split(order, np.flatnonzero(np.diff(piece[order])) + 1) if len(order) else []

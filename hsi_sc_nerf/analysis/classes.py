@@ -8,12 +8,13 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import nnls
-from trimesh.graph import connected_component_labels
 
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.numerics import spectral_angle
 
 UNCLASSIFIED = -1
+SMALLEST_REGION_M2 = 5e-6
+"""Smaller connected regions are not listed; their area still counts."""
 _CHUNK_SPECTRA = 1 << 12
 
 
@@ -76,9 +77,7 @@ def connected_regions(
     mesh: Mesh, labels: Int[np.ndarray, "v"], areas_m2: Float[np.ndarray, "v"], smallest_m2: float
 ) -> list[ConnectedRegion]:
     """Connected regions of one class with an area of at least ``smallest_m2``, in descending order of area."""
-    edges = mesh.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    edges = edges[labels[edges[:, 0]] == labels[edges[:, 1]]]
-    piece = connected_component_labels(edges, node_count=len(labels))
+    piece = mesh.pieces(labels)
     area = np.bincount(piece, areas_m2)
     centre = np.stack([np.bincount(piece, areas_m2 * x) for x in mesh.vertices.T], axis=-1)
     label = np.full(len(area), UNCLASSIFIED)

@@ -135,10 +135,7 @@ def solid_pieces(mesh: Mesh) -> Mesh:
 
     A stem apart from its fruit is kept; specks and bubbles inside the object (negative volume) are removed.
     """
-    from trimesh.graph import connected_component_labels  # takes seconds, and the help does without it
-
-    edges = mesh.triangles[:, [0, 1, 1, 2]].reshape(-1, 2)
-    piece = connected_component_labels(edges, node_count=len(mesh.vertices))[mesh.triangles[:, 0]]
+    piece = mesh.pieces()[mesh.triangles[:, 0]]
     fraction = np.bincount(piece) / len(piece)
     a, b, c = (mesh.vertices[corner] for corner in mesh.triangles.T)
     volume = np.bincount(piece, np.einsum("ij,ij->i", a, np.cross(b, c)))

@@ -20,7 +20,7 @@ from hsi_sc_nerf.files import atomic_write, read_json
 
 KIND = "hsi-sc-nerf regions"
 PAGE_POINTS = 50_000
-"""Points of the cloud that a page shows, unless it is asked for others."""
+"""Points of the cloud that a page shows by default."""
 _AGAIN = "save the regions again in the report's 3D view"
 _FAR_SPACINGS = 4.0
 """A surface farther from all points than so many times their distance is not the one that they lie on."""
@@ -126,7 +126,7 @@ def read_drawn_regions(path: Path | str) -> list[DrawnRegion]:
             raise ValueError(f"its kind is not {KIND}")
         points_m = np.array(content["points_m"], dtype=float)
         if points_m.ndim != 2 or points_m.shape[1] != 3 or len(points_m) < 2 or not np.isfinite(points_m).all():
-            raise ValueError("points_m is no list of places")
+            raise ValueError("points_m is no list of points")
         regions = [_region(points_m, one) for one in content["regions"]]
     except (LookupError, OverflowError, TypeError, ValueError) as error:
         raise InputError(f"{path}: holds no regions ({error}); {_AGAIN}.") from error

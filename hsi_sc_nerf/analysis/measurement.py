@@ -45,7 +45,7 @@ class Measurement:
         size: of the mesh.
         uncertainty: standard deviation of each size by its cause; empty without splits.
         traits: spectra, indices, calibrations and classes of the regions.
-        components: principal components and endmembers, if they were asked for.
+        components: principal components and endmembers; None if none were to be found.
         settings: that it was made with.
     """
 
@@ -77,7 +77,6 @@ def measure_traits(
     max_incidence_deg: float = MAX_INCIDENCE_DEG,
     library: SpectralLibrary | None = None,
     angle_rad: float = paper.CLASSIFICATION_ANGLE_RAD,
-    smallest_region_cm2: float = 0.05,
     regions: Mapping[str, Sequence[float]] | None = None,
     drawn_regions: Sequence[DrawnRegion] = (),
     indices: Sequence[str] = (),
@@ -95,7 +94,6 @@ def measure_traits(
         max_incidence_deg: spectra come from points that are seen at this angle at most.
         library: reference spectra to classify by.
         angle_rad: largest spectral angle to a class.
-        smallest_region_cm2: smaller regions of a class are not listed.
         regions: x, y, z of the centre and radius of each region of interest by its name, metres.
         drawn_regions: regions that were drawn in the report (`read_drawn_regions`).
         indices: names of the catalogue, or formulas as ``"CRI = 1/R510 - 1/R550"``.
@@ -133,7 +131,7 @@ def measure_traits(
             uncertainty = size_uncertainty(cloud.points, cloud.normals, closed, config, splits, shared, done=done)
     with console.status("spectra on the surface"):
         surface = with_spectra(closed, cloud, config.smoothing_radius_m, max_incidence_deg)
-        classes = classified(surface, library, angle_rad, smallest_region_cm2 * 1e-4) if library else None
+        classes = classified(surface, library, angle_rad) if library else None
         pixel_m = None if dataset is None else pixel_on_object_m(dataset)
         maps = index_maps(surface, found_indices)
         maps += [calibration_map(surface, one) for one in read if not one.classes]

@@ -53,7 +53,7 @@ def propose_organs(
     """Divide an object into its body and what differs from it: at its upper end, at its lower end, and at its sides.
 
     At an end, points are ordered by their distance from its tip, from where the axis meets it, and along the axis; at
-    the sides by their distance from places that are spread over the surface. An organ's edge is the distance at which
+    the sides by their distance from points that are spread over the surface. An organ's edge is the distance at which
     the spectra of the rings on both sides differ most, in standard deviations of the spectra within the two parts
     (Fisher's linear discriminant) and whatever their brightness. The discriminant then tells which points near the
     edge belong to the organ. A slim tip on something wide is a stem by its shape alone.
@@ -137,9 +137,9 @@ def _part_at_end(upper: bool, surface: _Surface, rest: Bool[np.ndarray, "n"]) ->
 
 
 def _part_at_side(surface: _Surface, rest: Bool[np.ndarray, "n"]) -> _Part | None:
-    """A small part with spectra of its own around a place anywhere on the surface.
+    """A small part with spectra of its own around a point anywhere on the surface.
 
-    The place is found on a sample of the points: among some that are spread over it, the best ones are moved to the
+    That point is found on a sample of the points: among some that are spread over it, the best ones are moved to the
     middle of what they found. Then all points are used.
     """
     points_m, features, near = surface.points_m, surface.features, surface.near
@@ -152,9 +152,9 @@ def _part_at_side(surface: _Surface, rest: Bool[np.ndarray, "n"]) -> _Part | Non
     def middle(edge: Edge) -> Float[np.ndarray, "3"]:
         return sample[beside(edge, some, every)].mean(axis=0)
 
-    def edges(places: Iterable[Float[np.ndarray, "3"]]) -> list[Edge]:
+    def edges(centres: Iterable[Float[np.ndarray, "3"]]) -> list[Edge]:
         # A larger part would be none of a side, and hide small ones.
-        distances = (np.linalg.norm(sample - place, axis=1) for place in places)
+        distances = (np.linalg.norm(sample - centre, axis=1) for centre in centres)
         found = (sharpest_edge(distance, some, every, largest=_SMALL) for distance in distances)
         return sorted((edge for edge in found if edge.separation), key=lambda edge: -edge.separation)[:_BEST_PLACES]
 

@@ -1,4 +1,4 @@
-"""Edges on a surface: the distance from a place at which spectra change most."""
+"""Edges on a surface: the distance from a point at which spectra change most."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def sharpest_edge(
     """The edge with the largest separation; 0 where no two rings differ by an angle that tells materials apart.
 
     Args:
-        distance: of the points from a place.
+        distance: of the points from one point.
         features: of their spectra.
         rest: points that count.
         between: least and largest radius.
@@ -52,8 +52,8 @@ def sharpest_edge(
     """
     none = Edge(distance, 0.0, 0.0, np.zeros(features.shape[1]), 0.0)
     radii, cuts, sums = rings(distance, features, rest, largest)
-    wanted = (between[0] <= radii) & (radii <= between[1])
-    radii, cuts = radii[wanted], cuts[wanted]
+    allowed = (between[0] <= radii) & (radii <= between[1])
+    radii, cuts = radii[allowed], cuts[allowed]
     inner, outer = (sums.moments(*cuts[:, ends].T)[0] for ends in ([0, 1], [2, 3]))
     inside, outside = sums.moments(np.zeros_like(cuts[:, 1]), cuts[:, 1]), sums.moments(cuts[:, 2])
     within = (inside[1] + outside[1]) / 2.0

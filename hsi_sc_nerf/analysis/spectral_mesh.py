@@ -66,9 +66,8 @@ class SpectralMesh:
 
     @cached_property
     def areas_m2(self) -> Float[np.ndarray, "v"]:
-        """Surface area of each vertex: a third of each of its triangles. The areas add up to the mesh's area."""
-        thirds = np.repeat(self.mesh.triangle_areas_m2() / 3.0, 3)
-        return np.bincount(self.mesh.triangles.ravel(), thirds, minlength=len(self.mesh.vertices))
+        """Surface area of each vertex, which is found once."""
+        return self.mesh.vertex_areas_m2()
 
 
 def with_spectra(

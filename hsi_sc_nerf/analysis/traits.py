@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.analysis.class_maps import ClassAreas, ClassMap, class_areas
 from hsi_sc_nerf.analysis.classes import (
+    SMALLEST_REGION_M2,
     UNCLASSIFIED,
     ConnectedRegion,
     class_areas_m2,
@@ -306,7 +307,10 @@ def mean_and_sd(values: Float[np.ndarray, "n *rest"], weights: Float[np.ndarray,
 
 
 def classified(
-    surface: SpectralMesh, library: SpectralLibrary, threshold_rad: float, smallest_region_m2: float
+    surface: SpectralMesh,
+    library: SpectralLibrary,
+    threshold_rad: float,
+    smallest_region_m2: float = SMALLEST_REGION_M2,
 ) -> Classes:
     """Classify the seen vertices against a library, brought to the surface's bands.
 

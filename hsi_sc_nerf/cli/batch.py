@@ -1,4 +1,4 @@
-"""Command on many sessions: ``batch``, a workflow that Snakemake runs on this machine or on a cluster."""
+"""Commands on many sessions: ``batch``, a workflow that Snakemake runs here or on a cluster, and ``collect``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from hsi_sc_nerf.batch.plan import STEPS, outdated, read_plan, unlisted, write_p
 from hsi_sc_nerf.batch.session_list import Row, read_sessions
 from hsi_sc_nerf.batch.session_steps import SessionSettings
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import read_json
+from hsi_sc_nerf.files import read_json, require_writable
 from hsi_sc_nerf.settings_file import check_options
 
 SNAKEFILE = Path(batch.__file__).with_name("Snakefile")
@@ -152,3 +152,41 @@ def _show_failures(out: Path) -> None:
             if record.get("status") == "failed" and one.step(step).needed:
                 console.print(f"[yellow]{escape(name)}, {step}: {escape(record['sentence'])}")
     console.print(f"{done} of {len(plan)} objects are done.", style="bold")
+
+
+@dataclass(frozen=True)
+class CollectCommand:
+    """Write one table and one page of all objects of a batch, failed ones with the sentence that says why.
+
+    Writes index.html (start here), traits.csv, traits_dictionary.csv and, where pyarrow is installed, traits.parquet.
+    `hsi-sc-nerf batch` ends with it; called again, it takes what is there by then.
+    """
+
+    output_dir: tyro.conf.Positional[Path]
+    """Folder of the batch, with sessions.csv and objects/."""
+
+    def main(self) -> None:
+        """Collect and write.
+
+        Raises:
+            InputError: there is no batch, or the results cannot be written.
+        """
+        from hsi_sc_nerf.batch.page import write_overview
+        from hsi_sc_nerf.batch.tables import CSV_NAME, listed_sessions, read_table, write_tables
+        from hsi_sc_nerf.terminal import progress_bar
+
+        out = self.output_dir
+        count = len(listed_sessions(out))
+        require_writable(out)
+        with progress_bar("reading", "objects", count) as done:
+            table = read_table(out, done)
+        parquet = write_tables(table, out)
+        with progress_bar("pictures", "objects", count) as done:
+            page = write_overview(table, out, done)
+        console = Console(highlight=False, soft_wrap=True)
+        if not parquet:
+            console.print(
+                "[yellow]traits.parquet is not written, because pyarrow is not installed; run `pip install "
+                "'hsi-sc-nerf\\[batch]'` to have it."
+            )
+        console.print(f"{count} objects. Open {escape(str(page))} in a browser; {CSV_NAME} holds the same.")

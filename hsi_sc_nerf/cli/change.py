@@ -57,11 +57,10 @@ class ChangeCommand:
     max_incidence_deg: float = MAX_INCIDENCE_DEG
     """Spectra come only from points that a camera sees at an incidence angle of at most this many degrees."""
     library: Path | None = None
-    """Reference spectra to classify the surface by, as for `hsi-sc-nerf traits`: ENVI library (.sli) or CSV."""
+    """Reference spectra to classify the surface by, as for `hsi-sc-nerf traits`: ENVI library (.sli) or CSV. Regions
+    below 0.05 cm2 are left out."""
     angle_rad: float = between(1e-6, math.pi, default=paper.CLASSIFICATION_ANGLE_RAD)
     """Largest spectral angle, in radians, between a spectrum and the mixture of its classes."""
-    smallest_region_cm2: float = 0.05
-    """Regions below this area are left out."""
 
     def main(self) -> None:
         """Compare and write.
@@ -106,10 +105,7 @@ class ChangeCommand:
             lambda starts: track(starts, "Registering", console=console, transient=True),
         )
         repeat = days.pop() if self.repeat else None
-        smallest_m2 = self.smallest_region_cm2 * 1e-4
-        compared = compare_days(
-            days, self.band_nm, indices, self.session_std, smallest_m2, library, self.angle_rad, repeat
-        )
+        compared = compare_days(days, self.band_nm, indices, self.session_std, library, self.angle_rad, repeat)
         steps = track(compared, "Comparing", total=len(days) - 1, console=console, transient=True)
         comparisons = list(steps)
 
@@ -127,7 +123,7 @@ class ChangeCommand:
             change_pictures.write_film(film, days[0], comparisons, views, shown)
             change_report.write_change_ply(self.output_dir / "change.ply", days[0], comparisons)
             settings = {"band_nm": list(self.band_nm), "session_std": self.session_std, **asdict(self.mesh)}
-            settings |= {"max_incidence_deg": self.max_incidence_deg, "smallest_region_cm2": self.smallest_region_cm2}
+            settings |= {"max_incidence_deg": self.max_incidence_deg}
             change_report.write_tables(self.output_dir, comparisons, settings, pictures, repeat)
         page = escape(str(self.output_dir / "change.md"))
         console.print(f"Changes, with pictures: {page}", soft_wrap=True)
@@ -162,8 +158,8 @@ def _day_names(paths: Sequence[Path]) -> list[str]:
     names = [_day_name(path) for path in paths]
     if len(set(names)) > 1:
         return names
-    places = [(path.parent if path.name == CONFIG else path).resolve().with_suffix("").parts for path in paths]
-    levels = zip(*map(reversed, places), strict=False)
+    folders = [(path.parent if path.name == CONFIG else path).resolve().with_suffix("").parts for path in paths]
+    levels = zip(*map(reversed, folders), strict=False)
     return next(([*level] for level in levels if len(set(level)) > 1), names)
 
 

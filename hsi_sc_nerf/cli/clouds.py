@@ -91,13 +91,12 @@ class TraitsCommand:
     oblique pixels are mixed. Sizes come from all points."""
     library: Path | None = None
     """Reference spectra to classify the surface by: ENVI spectral library (.sli) or CSV (first column wavelength in
-    nm, then a column a spectrum). Spectra of one name are references of one class."""
+    nm, then a column a spectrum). Spectra of one name are references of one class. The connected regions of
+    a class are listed from 0.05 cm2; the area of smaller ones counts as well."""
     classes: tuple[str, ...] = ()
     """Names of the library's spectra to use. Default: all."""
     angle_rad: float = between(1e-6, math.pi, default=paper.CLASSIFICATION_ANGLE_RAD)
     """Largest spectral angle, in radians, between a spectrum and its class."""
-    smallest_region_cm2: float = 0.05
-    """Connected regions of a class below this area are not listed (their area still counts)."""
     roi: Annotated[tuple[tuple[str, float, float, float, float], ...], tyro.conf.UseAppendAction] = ()
     """A region of interest: its name, x, y and z of its centre and its radius in metres. Repeat the option for each
     region."""
@@ -148,7 +147,6 @@ class TraitsCommand:
             max_incidence_deg=self.max_incidence_deg,
             library=library,
             angle_rad=self.angle_rad,
-            smallest_region_cm2=self.smallest_region_cm2,
             regions={name: (x_m, y_m, z_m, radius_m) for name, x_m, y_m, z_m, radius_m in self.roi},
             drawn_regions=read_drawn_regions(self.roi_file) if self.roi_file else (),
             indices=self.index,

@@ -117,7 +117,7 @@ class InspectCommand:
     """Check a session in seconds, before anything is computed from it.
 
     Prints a table of findings: green is as it should be, amber is worth a look, red would spoil the results. Exits
-    with status 2 if something is red. Of a processed dataset, prints the effects that the session calls for.
+    with status 2 if something is red. Of a processed dataset, prints the effects that the session has.
     """
 
     session: tyro.conf.Positional[Path]

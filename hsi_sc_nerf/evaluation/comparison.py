@@ -29,7 +29,8 @@ Track = Callable[[Sequence[Any], str], Iterable[Any]]
 
 FORMATS = (".ply", ".obj", ".stl")
 METRES = {"m": 1.0, "mm": 0.001}
-THRESHOLDS = 201
+THRESHOLDS, LARGEST_THRESHOLD_M = 201, 5 * paper.F_SCORE_THRESHOLD_M
+"""Number of thresholds of the curves, and the largest."""
 FEWEST_POINTS = 100
 LARGEST_RATIO = 10.0
 """If one of the two is larger than this times the other, their units differ."""
@@ -52,15 +53,11 @@ class CompareConfig:
     """Unit of length of the reference file."""
     threshold_m: float = paper.F_SCORE_THRESHOLD_M
     """Distance within which a point is correct, in metres; 0.002 is the paper's."""
-    largest_threshold_m: float = 5 * paper.F_SCORE_THRESHOLD_M
-    """Largest threshold of the curves, in metres."""
     points: int = 100_000
     """Number of points sampled on a mesh, evenly over its area."""
     whole_reference: bool = False
     """With a simulated session: recall also counts the parts of the true surface that no view sees, such as the
     base."""
-    seed: int = 0
-    """Random seed: the same seed gives the same figures."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +97,7 @@ class Comparison:
     @cached_property
     def curves(self) -> ThresholdCurves:
         """From 0 to the largest threshold."""
-        thresholds_m = np.linspace(0.0, self.config.largest_threshold_m, THRESHOLDS)
+        thresholds_m = np.linspace(0.0, LARGEST_THRESHOLD_M, THRESHOLDS)
         return threshold_curves(self.to_reference_m, self.to_cloud_m, thresholds_m)
 
     @cached_property
@@ -178,7 +175,7 @@ def surface_of(path: Path, config: CompareConfig, unit_m: float = 1.0) -> Surfac
     if not len(triangles):
         return Surface(vertices)
     try:
-        return Surface(sample_surface(vertices, triangles, config.points, config.seed), vertices, triangles)
+        return Surface(sample_surface(vertices, triangles, config.points), vertices, triangles)
     except ValueError as error:
         raise InputError(f"{path}: its triangles have no area; export the mesh again.") from error
 
@@ -225,12 +222,8 @@ def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _check(config: CompareConfig, alignment: Alignment) -> None:
-    for option, value in {
-        "--threshold-m": config.threshold_m,
-        "--largest-threshold-m": config.largest_threshold_m,
-    }.items():
-        if not value > 0:
-            raise InputError(f"{option} is {value}; it must be more than 0.")
+    if not config.threshold_m > 0:
+        raise InputError(f"--threshold-m is {config.threshold_m}; it must be more than 0.")
     if config.points < FEWEST_POINTS:
         raise InputError(f"--points is {config.points}; {FEWEST_POINTS} are needed at least.")
     if config.with_scale and alignment == "none":
@@ -272,10 +265,8 @@ def _register(
         return None
     clouds = cloud.points_m, reference.surface.points_m
     if alignment == "icp":
-        return refine(*clouds, with_scale=config.with_scale, seed=config.seed)
-    found = align_by_features(
-        *clouds, config.with_scale, config.seed, lambda starts: track(starts, "Trying other attitudes")
-    )
+        return refine(*clouds, with_scale=config.with_scale)
+    found = align_by_features(*clouds, config.with_scale, lambda starts: track(starts, "Trying other attitudes"))
     if found.rival is not None and not config.accept_symmetric:
         raise InputError(
             f"{cloud_name}: features do not determine its attitude in {reference.name}, because turned by "

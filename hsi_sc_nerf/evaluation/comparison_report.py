@@ -14,7 +14,7 @@ from matplotlib import colormaps, rc_context
 from plyfile import PlyData
 
 from hsi_sc_nerf import __version__, paper
-from hsi_sc_nerf.evaluation.comparison import Comparison
+from hsi_sc_nerf.evaluation.comparison import LARGEST_THRESHOLD_M, Comparison
 from hsi_sc_nerf.evaluation.spatial import ThresholdCurves, distance_statistics, score_at, threshold_for_m
 from hsi_sc_nerf.files import atomic_write, write_json
 from hsi_sc_nerf.geometry.ply_file import ply_vertices
@@ -154,7 +154,7 @@ def _page(
 {markdown_table(*scores)}
 
 The F-score reaches {reached}. It never falls as the threshold grows; the knee is where it stops rising steeply, seen
-from 0 to {1000 * comparison.config.largest_threshold_m:g} mm.
+from 0 to {1000 * LARGEST_THRESHOLD_M:g} mm.
 
 {markdown_table(*distances)}
 

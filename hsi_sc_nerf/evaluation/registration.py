@@ -62,7 +62,6 @@ def refine(
     reference_m: Float[np.ndarray, "m 3"],
     start: Similarity | None = None,
     with_scale: bool = False,
-    seed: int = 0,
 ) -> Registration:
     """Iterative closest points, point to tangent plane, with Tukey's loss, from a roughly correct start.
 
@@ -76,9 +75,9 @@ def refine(
         >>> shifted_m = reference_m + [0.002, 0.0, 0.0]
         >>> refine(shifted_m, reference_m).transform(shifted_m)  # close to reference_m
     """
-    target = _Target(drawn(reference_m, REFERENCE_POINTS, seed))
-    transform = _approached(drawn(cloud_m, SEARCH_POINTS, seed), target, start or Similarity(), with_scale)
-    moved_m = drawn(cloud_m, MOVED_POINTS, seed)
+    target = _Target(drawn(reference_m, REFERENCE_POINTS))
+    transform = _approached(drawn(cloud_m, SEARCH_POINTS), target, start or Similarity(), with_scale)
+    moved_m = drawn(cloud_m, MOVED_POINTS)
     off_m = np.median(target.off_plane_m(transform(moved_m), target.radius_m / 10))
     spacing_m = np.median(target.tree.query(target.points[:: max(1, len(target.points) // 1000)], k=2)[0][:, 1])
     within_m = min(target.radius_m / 10, float(3 * SIGMA_OF_MAD * off_m + 2 * spacing_m))
@@ -89,7 +88,6 @@ def align_by_features(
     cloud_m: Float[np.ndarray, "n 3"],
     reference_m: Float[np.ndarray, "m 3"],
     with_scale: bool = False,
-    seed: int = 0,
     track: Callable[[list[Similarity]], Iterable[Similarity]] = iter,
 ) -> Registration:
     """Align clouds that lie anywhere: fast point feature histograms (Rusu et al. 2009), RANSAC, `refine`.
@@ -103,9 +101,9 @@ def align_by_features(
     """
     import open3d
 
-    open3d.utility.random.seed(seed)
-    cloud, reference = (_Target(drawn(points, MOVED_POINTS, seed)) for points in (cloud_m, reference_m))
-    few, thinned = drawn(cloud_m, SEARCH_POINTS, seed), _Target(drawn(reference_m, SEARCH_REFERENCE_POINTS, seed))
+    open3d.utility.random.seed(0)
+    cloud, reference = (_Target(drawn(points, MOVED_POINTS)) for points in (cloud_m, reference_m))
+    few, thinned = drawn(cloud_m, SEARCH_POINTS), _Target(drawn(reference_m, SEARCH_REFERENCE_POINTS))
     sized = Similarity(reference.radius_m / cloud.radius_m if with_scale else 1.0)
     cap_m = reference.radius_m / 10
 
@@ -126,7 +124,7 @@ def align_by_features(
         if turn_deg > SAME_TURN_DEG and not other.is_worse_than(best):
             rival = Rival(turn_deg, other.rms(), best.rms())
             break
-    last = refine(cloud_m, reference_m, best.transform, with_scale, seed)
+    last = refine(cloud_m, reference_m, best.transform, with_scale)
     return Registration(last.transform, last.within_m, rival)
 
 
@@ -181,12 +179,12 @@ def robust_radius(points: Float[np.ndarray, "n 3"]) -> float:
     return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
 
 
-def drawn(points: Float[np.ndarray, "n 3"], count: int, seed: int) -> Float[np.ndarray, "m 3"]:
-    """A random subset of at most ``count`` points."""
+def drawn(points: Float[np.ndarray, "n 3"], count: int) -> Float[np.ndarray, "m 3"]:
+    """A random subset of at most ``count`` points, each time the same."""
     points = np.asarray(points, float)
     if len(points) <= count:
         return points
-    return points[np.random.default_rng(seed).choice(len(points), count, replace=False)]
+    return points[np.random.default_rng(0).choice(len(points), count, replace=False)]
 
 
 def _approached(few: np.ndarray, target: _Target, start: Similarity, with_scale: bool) -> Similarity:

@@ -57,9 +57,9 @@ def to_xarray(cloud: SpectralCloud, run: str = "") -> xarray.Dataset:
         name: (dimensions, columns[name].astype(dtype), attributes)
         for name, dtype, dimensions, attributes in table_variables(cloud.wavelengths_nm, cloud.extra)
     }
-    places = {axis: variables.pop(axis) for axis in "xyz"}
+    positions = {axis: variables.pop(axis) for axis in "xyz"}
     wavelength = ("wavelength", np.asarray(cloud.wavelengths_nm, float), WAVELENGTH_ATTRIBUTES)
-    return xarray.Dataset(variables, places | {"wavelength": wavelength}, table_attributes(run))
+    return xarray.Dataset(variables, positions | {"wavelength": wavelength}, table_attributes(run))
 
 
 def from_xarray(table: xarray.Dataset) -> SpectralCloud:
@@ -87,7 +87,7 @@ def from_xarray(table: xarray.Dataset) -> SpectralCloud:
 def table_variables(
     wavelengths_nm: Shaped[np.ndarray, "bands"], extra_names: Iterable[str]
 ) -> Iterator[tuple[str, str, tuple[str, ...], dict[str, str]]]:
-    """Name, type, dimensions and attributes of each variable; the places of points are coordinates."""
+    """Name, type, dimensions and attributes of each variable; the positions of points are coordinates."""
     extra_names, meanings = tuple(extra_names), dict(zip(_SPECTRAL, (REFLECTANCE, MATERIAL), strict=True)) | COLUMNS
     of_material = _of_material(wavelengths_nm, extra_names)
     spectral = _SPECTRAL if of_material else _SPECTRAL[:1]

@@ -41,6 +41,11 @@ class Mesh:
         """Area of each triangle."""
         return np.linalg.norm(self._doubled_normals(), axis=1) / 2.0
 
+    def vertex_areas_m2(self) -> Float[np.ndarray, "v"]:
+        """Surface area of each vertex: a third of each of its triangles. The areas add up to the mesh's area."""
+        thirds = np.repeat(self.triangle_areas_m2() / 3.0, 3)
+        return np.bincount(self.triangles.ravel(), thirds, minlength=len(self.vertices))
+
     def volume_m3(self) -> float:
         """Enclosed volume of a closed mesh (divergence theorem)."""
         first = self.vertices[self.triangles[:, 0]]
@@ -66,6 +71,19 @@ class Mesh:
         """Sum of the outward normals of each vertex's triangles, each as long as twice the triangle's area."""
         corners, doubled = self.triangles.ravel(), np.repeat(self._doubled_normals(), 3, axis=0)
         return np.stack([np.bincount(corners, axis, len(self.vertices)) for axis in doubled.T], axis=-1)
+
+    def pieces(self, labels: Int[np.ndarray, "v"] | None = None) -> Int[np.ndarray, "v"]:
+        """Number of each vertex's connected piece, from 0.
+
+        Args:
+            labels: only edges between vertices of one label connect; all edges without it.
+        """
+        from trimesh.graph import connected_component_labels  # takes seconds, and the help does without it
+
+        edges = self.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+        if labels is not None:
+            edges = edges[labels[edges[:, 0]] == labels[edges[:, 1]]]
+        return connected_component_labels(edges, node_count=len(self.vertices))
 
     def _doubled_normals(self) -> Float[np.ndarray, "t 3"]:
         a, b, c = (self.vertices[self.triangles[:, i]] for i in range(3))

@@ -119,7 +119,7 @@ class PackedDataset:
         typical_uncertainty: standard deviation by band at the object's mean reflectance; None likewise.
         pose_method: how the poses were estimated ("markers", "colmap", "angles"); None if that is unknown.
         fingerprint: of the session and the settings that the dataset was made from.
-        effects: that the session calls for, and those that it does not; empty in datasets of older versions.
+        effects: present in the session or not, by their evidence; empty in datasets of older versions.
     """
 
     root: Path

@@ -57,8 +57,8 @@ def marker_sheets(marker_side_m: float, dictionary: str, ids: Sequence[int], pap
         top = height - _MARGIN_MM
         title = f'{dictionary}, black squares of {side:g} mm: "marker_side_m": {marker_side_m:g} in session.json'
         axes.text(_MARGIN_MM, top, title, va="top", size=10)
-        for place, number in enumerate(ids[start : start + columns * rows]):
-            row, column = divmod(place, columns)
+        for position, number in enumerate(ids[start : start + columns * rows]):
+            row, column = divmod(position, columns)
             left = _MARGIN_MM + column * across + quiet
             upper = top - _HEAD_MM - row * down - quiet
             _draw_marker(axes, marker_pattern(dictionary, number), left, upper, side)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -22,8 +22,9 @@ from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, PixelFlag
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES
 from hsi_sc_nerf.spectra import to_8_bit
 
-GRAY = "gray"
-"""The mean over the range in which markers are printed to be seen; it is there always."""
+GRAY, GRAY_NM = "gray", (450.0, 700.0)
+"""The mean over the range in which markers are printed to be seen (many inks are transparent beyond it); it is there
+always."""
 BAND_GROUPS_NM: Mapping[str, tuple[float, float]] = {
     "blue": (450.0, 500.0),
     "green": (500.0, 600.0),
@@ -113,12 +114,7 @@ def check_frames(images: Sequence[UInt8[np.ndarray, "h w"]], names: Sequence[str
         )
 
 
-def frame_pictures(
-    cube_path: Path,
-    flags_path: Path,
-    gray: UInt8[np.ndarray, "h w"],
-    gray_nm: tuple[float, float],
-) -> FramePictures:
+def frame_pictures(cube_path: Path, flags_path: Path, gray: UInt8[np.ndarray, "h w"]) -> FramePictures:
     """Pictures of a packed frame: scored from a few bands of each group, computed from all at the first access.
 
     Args:
@@ -129,7 +125,7 @@ def frame_pictures(
     wavelengths_nm = cube.wavelengths_nm
     members = {
         name: (wavelengths_nm >= low) & (wavelengths_nm <= high)
-        for name, (low, high) in {GRAY: gray_nm, **BAND_GROUPS_NM}.items()
+        for name, (low, high) in {GRAY: GRAY_NM, **BAND_GROUPS_NM}.items()
     }
     # If the instrument has no band there, the broad mean was made of all bands.
     members[GRAY] = members[GRAY] if members[GRAY].any() else np.ones(len(wavelengths_nm), bool)
@@ -174,13 +170,10 @@ def read_pictures(
     cube_paths: Sequence[Path],
     flags_paths: Sequence[Path],
     grays: Sequence[UInt8[np.ndarray, "h w"]],
-    gray_nm: tuple[float, float],
 ) -> SessionPictures:
     """``frame_pictures`` of all frames."""
     with ThreadPoolExecutor(_WORKERS) as pool:
-        return SessionPictures(
-            list(pool.map(partial(frame_pictures, gray_nm=gray_nm), cube_paths, flags_paths, grays))
-        )
+        return SessionPictures(list(pool.map(frame_pictures, cube_paths, flags_paths, grays)))
 
 
 def group_means(

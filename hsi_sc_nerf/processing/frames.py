@@ -31,13 +31,12 @@ from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write, write_png
 from hsi_sc_nerf.packed.cube import write_packed_cube
+from hsi_sc_nerf.poses.session_pictures import GRAY_NM
 from hsi_sc_nerf.processing.foreground_score import smoothed_bins, spectral_bin_width
 from hsi_sc_nerf.spectra import bands_within, nearest_bands, to_8_bit
 from hsi_sc_nerf.terminal import progress_bar
 
 _DIGEST_BYTES = hashlib.sha256().digest_size
-MARKER_RANGE_NM = (450.0, 700.0)
-"""Markers are detected in the mean image of these bands: many inks are transparent beyond 700 nm."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +104,6 @@ def pack_frames(
     output_dir: Path,
     *,
     pseudo_rgb_nm: tuple[float, float, float] = paper.PSEUDO_RGB_NM,
-    marker_range_nm: tuple[float, float] = MARKER_RANGE_NM,
     workers: int = 2,
     progress: bool = False,
 ) -> list[FrameCache]:
@@ -113,7 +111,6 @@ def pack_frames(
 
     Args:
         pseudo_rgb_nm: wavelengths shown as red, green and blue.
-        marker_range_nm: bands that are averaged into the gray image.
         workers: frames that are calibrated at the same time.
 
     Returns:
@@ -136,16 +133,13 @@ def pack_frames(
             own.buffer = np.empty(num_values, np.uint16)
         capture, frame_calibration = session.frames[index], calibration.frames[index]
         paths = FramePaths.of(output_dir, capture.name)
-        key = fingerprint(
-            [pseudo_rgb_nm, marker_range_nm, capture_files(session, capture), _digest(frame_calibration)]
-        )
+        key = fingerprint([pseudo_rgb_nm, capture_files(session, capture), _digest(frame_calibration)])
         return read_cache(paths, key) or process_frame(
             calibration.cubes[index],
             frame_calibration,
             paths,
             key,
             pseudo_rgb_nm=pseudo_rgb_nm,
-            marker_range_nm=marker_range_nm,
             buffer=own.buffer,
         )
 
@@ -170,7 +164,6 @@ def process_frame(
     fingerprint: str,
     *,
     pseudo_rgb_nm: tuple[float, float, float] = paper.PSEUDO_RGB_NM,
-    marker_range_nm: tuple[float, float] = MARKER_RANGE_NM,
     buffer: UInt16[np.ndarray, "values"] | None = None,
 ) -> FrameCache:
     """Calibrate a frame's raw cube; write its packed cube, flags, pseudo-RGB image and cache, all upright.
@@ -178,7 +171,7 @@ def process_frame(
     Args:
         cube: raw counts, or finished reflectance.
         fingerprint: of what the frame is made from, kept in its cache.
-        pseudo_rgb_nm, marker_range_nm: as in `pack_frames`.
+        pseudo_rgb_nm: as in `pack_frames`.
         buffer: memory to pack in (`pack_counts`), which several frames may use in turn.
 
     Raises:
@@ -188,7 +181,7 @@ def process_frame(
     widths_nm = None if cube.fwhm_nm is None else cube.fwhm_nm[calibration.bands]
     picture_bands = PictureBands(
         rgb=nearest_bands(wavelengths_nm, pseudo_rgb_nm),
-        gray=bands_within(wavelengths_nm, marker_range_nm),
+        gray=bands_within(wavelengths_nm, GRAY_NM),
         bin_width=spectral_bin_width(len(wavelengths_nm)),
     )
     with CubeLines(cube) as lines:

@@ -23,7 +23,7 @@ from hsi_sc_nerf.poses.pose_methods import PoseMethod
 from hsi_sc_nerf.poses.report import check_poses, describe_poses, draw_poses, pose_report
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.poses.session_pictures import GRAY, read_pictures
-from hsi_sc_nerf.processing.frames import MARKER_RANGE_NM, FramePaths
+from hsi_sc_nerf.processing.frames import FramePaths
 
 _log = logging.getLogger(__name__)
 
@@ -40,15 +40,13 @@ def pose_frames(
     output_dir: Path,
     console: Console,
     find_poses: PoseFunction,
-    marker_range_nm: tuple[float, float] = MARKER_RANGE_NM,
     check: Callable[[Sequence[Finding]], None] = refuse_red,
 ) -> TurntablePoses:
     """Find and check the poses, write ``poses.json`` and its figure, and print what was found.
 
     Args:
         session: its frames are packed under ``output_dir``.
-        images: the mean over ``marker_range_nm`` of each frame.
-        marker_range_nm: range in which the markers' ink is visible.
+        images: the mean over ``GRAY_NM`` of each frame.
         check: called with the findings on the poses; raises where one is red.
 
     Raises:
@@ -59,7 +57,7 @@ def pose_frames(
     pictures = None
     if method != "angles" or camera is None:
         paths = [FramePaths.of(output_dir, name) for name in names]
-        pictures = read_pictures([p.cube for p in paths], [p.flags for p in paths], images, marker_range_nm)
+        pictures = read_pictures([p.cube for p in paths], [p.flags for p in paths], images)
     try:
         with console.status("finding poses"):
             poses = find_poses(pictures or images, names, info=info, method=method, camera=camera)

@@ -37,7 +37,6 @@ from hsi_sc_nerf.processing.appearance_checks import check_appearance, check_ban
 from hsi_sc_nerf.processing.chamber import background_spectrum
 from hsi_sc_nerf.processing.effects import draw_effects, measure_effects, points_of_object, show_effects
 from hsi_sc_nerf.processing.frames import (
-    MARKER_RANGE_NM,
     BinsOfFrames,
     FrameCache,
     pack_frames,
@@ -72,8 +71,6 @@ class ProcessConfig:
     markers nor texture."""
     marker_side_m: float | None = None
     """Side of a marker's black square, metres; session.json's if not given."""
-    marker_range_nm: tuple[float, float] = MARKER_RANGE_NM
-    """Markers are detected in the mean image of these bands, nm: many inks are transparent beyond 700 nm."""
     workers: int = 2
     """Number of frames that are calibrated at the same time; each needs memory for about two copies of a raw cube."""
     exclude: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
@@ -142,7 +139,6 @@ def process_session(
         calibration,
         output_dir,
         pseudo_rgb_nm=config.pseudo_rgb_nm,
-        marker_range_nm=config.marker_range_nm,
         workers=config.workers,
         progress=progress,
     )
@@ -158,7 +154,6 @@ def process_session(
         output_dir,
         console,
         estimate_poses,
-        config.marker_range_nm,
         checks.add,
     )
     caches = [cache for cache, used in zip(caches, poses.used, strict=True) if used]

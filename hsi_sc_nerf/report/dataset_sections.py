@@ -68,13 +68,13 @@ def inspection_section(dataset: PackedDataset) -> list[Section]:
 
 
 def effects_section(dataset: PackedDataset) -> list[Section]:
-    """The effects that the session calls for; nothing of a dataset that does not know them."""
+    """The effects of the session by their evidence; nothing of a dataset without any."""
     if not dataset.effects:
         return []
     rows = [
         (*row, effect.sentence) for row, effect in zip(effect_rows(dataset.effects), dataset.effects, strict=True)
     ]
-    table = Table("The effects that the session calls for.", (*EFFECT_COLUMNS, ""), rows)
+    table = Table("Effects of the session, and their evidence.", (*EFFECT_COLUMNS, ""), rows)
     return [
         Section("effects", "Effects", [table, *_folded_picture(dataset, "effects.png", "Evidence over threshold")])
     ]

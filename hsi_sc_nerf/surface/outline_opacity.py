@@ -145,11 +145,11 @@ def outline_pixels(
         inwards = unit_vectors(gradient[tuple(on.T)])
         of_on = depth_px[tuple(on.T)][:, None]
         inside, outside = (np.rint(on + (to_px - of_on) * inwards).astype(int) for to_px in (inside_px, -PURE_PX))
-        within = [((places >= 0) & (places < mask.shape)).all(axis=1) for places in (inside, outside)]
-        on, inside, outside = (places[within[0] & within[1]] for places in (on, inside, outside))
+        within = [((pixels >= 0) & (pixels < mask.shape)).all(axis=1) for pixels in (inside, outside)]
+        on, inside, outside = (pixels[within[0] & within[1]] for pixels in (on, inside, outside))
         pure = (depth_px[tuple(inside.T)] >= inside_px - 1.0) & (depth_px[tuple(outside.T)] <= 1.0 - PURE_PX)
         pure &= chamber[tuple(outside.T)]
-        found.append(tuple(np.insert(places[pure], 0, frame, axis=1) for places in (on, inside, outside)))
+        found.append(tuple(np.insert(pixels[pure], 0, frame, axis=1) for pixels in (on, inside, outside)))
     on, inside, outside = (np.concatenate(part) for part in zip(*found, strict=True))
     return on, inside, outside
 
@@ -168,7 +168,7 @@ def pixel_coverage(
     Returns:
         About 0 to 1, with the noise of the spectra; NaN where the two spectra are too similar.
     """
-    batches = [sampler.at(places) for places in (on, inside, outside)]
+    batches = [sampler.at(pixels) for pixels in (on, inside, outside)]
     mixed, covered, bare = (batch["spectral"].astype(np.float64) for batch in batches)
     valid = np.logical_and.reduce([batch.get("valid", np.ones(mixed.shape, bool)) for batch in batches])
     contrast = np.where(valid, covered - bare, 0.0)

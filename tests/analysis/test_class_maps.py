@@ -21,11 +21,13 @@ SOUND, BRUISED, OTHER = np.linspace(0.3, 0.6, 6), np.linspace(0.5, 0.3, 6), np.a
 MODELS = Path(__file__).parent / "calibrations_onnx"
 
 
-def classifier(noise, share=0.5, domain=None):
+def classifier(noise, fraction=0.5, domain=None):
     """Linear discriminant analysis of two spectra with the same noise in each band: the exact probabilities."""
 
     def predict(spectra):
-        towards = (spectra - (SOUND + BRUISED) / 2.0) @ (BRUISED - SOUND) / noise**2 + np.log(share / (1.0 - share))
+        towards = (spectra - (SOUND + BRUISED) / 2.0) @ (BRUISED - SOUND) / noise**2 + np.log(
+            fraction / (1.0 - fraction)
+        )
         p = 1.0 / (1.0 + np.exp(-np.clip(towards, -500.0, 500.0)))
         return np.stack([1.0 - p, p], axis=1)
 
@@ -41,9 +43,9 @@ def surface_of(spectra, nm=NM, scatter=None):
     return SpectralMesh(MESH, np.array(spectra), nm, np.ones(count, bool), None, scatter and np.full(count, scatter))
 
 
-def in_two_parts(rng, noise, share):
+def in_two_parts(rng, noise, fraction):
     """Bruised at random places: as far as areas are concerned, nothing says that they touch."""
-    bruised = rng.uniform(size=len(MESH.vertices)) < share
+    bruised = rng.uniform(size=len(MESH.vertices)) < fraction
     spectra = np.where(bruised[:, None], BRUISED, SOUND)
     return spectra + noise * rng.standard_normal(spectra.shape), bruised
 
@@ -75,16 +77,16 @@ def test_half_of_the_area_is_in_doubt_where_both_classes_are_as_probable():
 
 
 @pytest.mark.parametrize("noise", [0.1, 0.2])
-@pytest.mark.parametrize("share", [0.1, 0.5])
+@pytest.mark.parametrize("fraction", [0.1, 0.5])
 @pytest.mark.parametrize("scatter", [False, True])
-def test_the_standard_deviation_tells_how_far_areas_are_from_the_truth(noise, share, scatter):
+def test_the_standard_deviation_tells_how_far_areas_are_from_the_truth(noise, fraction, scatter):
     """Root mean square of errors over stated deviations: about 1, and below it where the noise is counted twice."""
     ratios = []
     for seed in range(60):
-        spectra, bruised = in_two_parts(np.random.default_rng(seed), noise, share)
+        spectra, bruised = in_two_parts(np.random.default_rng(seed), noise, fraction)
         surface = surface_of(spectra, scatter=noise if scatter else None)
         pixel_m = np.sqrt(np.mean(surface.areas_m2**2) / np.mean(surface.areas_m2))
-        areas = class_areas(class_map(surface, classifier(noise, share)), surface.seen, surface, pixel_m)
+        areas = class_areas(class_map(surface, classifier(noise, fraction)), surface.seen, surface, pixel_m)
         ratios.append((areas.areas_m2[1] - surface.areas_m2[bruised].sum()) / areas.stds_m2[1])
     assert (0.4 if scatter else 0.6) < np.sqrt(np.mean(np.square(ratios))) < 1.3
 

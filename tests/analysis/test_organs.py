@@ -133,8 +133,8 @@ def test_a_part_at_the_lower_edge_is_an_organ_if_it_does_not_fade_towards_its_ow
     points_m = ball(12_000, rng)
     points_m = points_m[points_m[:, 2] > -0.8 * RADIUS_M]
     height = (points_m[:, 2] - points_m[:, 2].min()) / 0.006
-    share = np.clip(0.8 * (1.0 - height), 0.0, 1.0) if falls else 0.8 * (height < 1.0)
-    found = propose_organs(points_m, noisy(SKIN + share[:, None] * (GREEN - SKIN), rng))
+    fraction = np.clip(0.8 * (1.0 - height), 0.0, 1.0) if falls else 0.8 * (height < 1.0)
+    found = propose_organs(points_m, noisy(SKIN + fraction[:, None] * (GREEN - SKIN), rng))
     assert (list(found) == ["body"]) == falls
     if not falls:
         assert overlap(next(where for name, where in found.items() if name != "body"), height < 1.0) > 0.9
@@ -180,8 +180,8 @@ def test_no_organ_is_invented(shape, coloured):
 @pytest.mark.parametrize("count", [1, 8, 63, 64, 100])
 def test_few_or_equal_points_are_a_body(count):
     points_m = ball(count, np.random.default_rng(0))
-    for places in (points_m, 0.0 * points_m):
+    for points in (points_m, 0.0 * points_m):
         for spectra in (np.tile(SKIN, (count, 1)), np.zeros((count, len(NM)))):
-            found = propose_organs(places, spectra)
+            found = propose_organs(points, spectra)
             assert list(found) == ["body"]
             assert found["body"].all()

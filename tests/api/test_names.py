@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import hsi_sc_nerf
-from hsi_sc_nerf.cli.commands import COMMANDS
+from hsi_sc_nerf.cli.main import COMMANDS
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from PIL import Image
 
 from hsi_sc_nerf.batch.page import thumbnail, write_overview
 from hsi_sc_nerf.batch.tables import read_table
-from hsi_sc_nerf.cli.collect import CollectCommand
+from hsi_sc_nerf.cli.batch import CollectCommand
 from hsi_sc_nerf.files import write_png
 
 HOSTILE = "</script><img src=x onerror=alert(1)>\"'&{{ 7 * 7 }}"

@@ -9,7 +9,7 @@ from batch_folder import traits_of, write_object, write_season, write_sessions
 from hsi_sc_nerf.batch import columns
 from hsi_sc_nerf.batch.columns import STANDING, class_columns, region_columns
 from hsi_sc_nerf.batch.tables import named_apart, read_table, write_tables
-from hsi_sc_nerf.cli.collect import CollectCommand
+from hsi_sc_nerf.cli.batch import CollectCommand
 from hsi_sc_nerf.errors import InputError
 
 HOSTILE = "</script><img src=x onerror=alert(1)>\"'&{{ 7 * 7 }},\n=1+1"

@@ -146,7 +146,7 @@ def moving_average(spectrum, width):
     return np.stack([spectrum[..., b - r : b + r + 1].mean(axis=-1) for b, r in enumerate(reach)], axis=-1)
 
 
-# The white averaged over many pixels, and over so few that its share shows; many dark lines, and few.
+# The white averaged over many pixels, and over so few that its part of the noise shows; many dark lines, and few.
 @pytest.mark.slow
 @pytest.mark.parametrize(("white_lines", "columns", "dark_lines"), [(20, 20, 16), (1, 3, 2)])
 def test_agrees_with_repeated_exposures(white_lines, columns, dark_lines):

@@ -8,7 +8,7 @@ import ball_run
 import capture_factory as factory
 import numpy as np
 import pytest
-from another_day import CloudErrors, SetDown, cloud_of, fruit_of
+from another_day import CloudErrors, SetDown, bruise_cm2, cloud_of, fruit_of
 
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
 from hsi_sc_nerf.cli import change
@@ -57,14 +57,9 @@ def rows_of(written, **wanted):
         return [row for row in csv.DictReader(file) if all(row[key] == value for key, value in wanted.items())]
 
 
-def bruise_cm2(day):
-    fruit = fruit_of(day, NM)
-    of_vertices = np.bincount(fruit.mesh.triangles.ravel(), np.repeat(fruit.mesh.triangle_areas_m2() / 3.0, 3))
-    return 1e4 * of_vertices[fruit.weights[:, fruit.materials.index("bruise")] > 0.45].sum()
-
-
 def true_growth_cm2():
-    return bruise_cm2(DAYS["friday"]) - bruise_cm2(DAYS["monday"])
+    monday_cm2, friday_cm2 = (bruise_cm2(fruit_of(DAYS[day], NM)) for day in ("monday", "friday"))
+    return friday_cm2 - monday_cm2
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ import pressed_at_import
 import pytest
 
 from hsi_sc_nerf.cli import main as entry
-from hsi_sc_nerf.cli.commands import COMMANDS
+from hsi_sc_nerf.cli.main import COMMANDS
 from hsi_sc_nerf.cli.sessions import MarkersCommand
 from hsi_sc_nerf.errors import InputError
 

@@ -172,8 +172,7 @@ def test_files_that_cannot_be_compared(mesh: Path, tmp_path: Path, name: str, te
 @pytest.mark.parametrize(
     ("config", "told"),
     [
-        (CompareConfig(threshold_m=0), "--threshold-m is 0"),
-        (CompareConfig(largest_threshold_m=float("nan")), "--largest-threshold-m is nan"),
+        (CompareConfig(threshold_m=float("nan")), "--threshold-m is nan"),
         (CompareConfig(points=5), "--points is 5"),
         (CompareConfig(align="none", with_scale=True), "choose one"),
     ],

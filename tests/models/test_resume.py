@@ -80,7 +80,8 @@ def test_the_same_seed_gives_the_same_weights_and_another_does_not(tiny_dataset,
         weights = []
         for number, seed in enumerate((3, 3, 4)):
             machine = MachineConfig(seed=seed, device_type="cpu")
-            made = longer(tiny_dataset, tmp_path / str(number), machine=machine, steps_per_save=STEPS)
+            options = {"switch": 4, "max_num_iterations": 8, "machine": machine}
+            made = longer(tiny_dataset, tmp_path / str(number), **options)
             made.train()
             weights.append(checkpoint(made.checkpoint_dir))
             torch.rand(7)  # what was drawn before does not matter

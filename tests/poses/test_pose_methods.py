@@ -36,10 +36,10 @@ def pear():
 
 
 @pytest.fixture(scope="module")
-def from_features(pear):
-    """`poses_from_features` of the pear, whose features are matched once for all tests."""
+def free(pear):
+    """Poses of the pear by its features, which are matched once for all tests."""
     images, names, *_ = pear
-    return partial(poses_from_features, free=structure_from_motion(images, names))
+    return structure_from_motion(images, names)
 
 
 def pear_info(**values):
@@ -49,9 +49,9 @@ def pear_info(**values):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("method", "largest_deg", "largest_mm"), [("auto", 0.1, 0.5), ("colmap", 0.2, 1.0)])
-def test_markers_give_the_poses_and_help_features(pear, from_features, method, largest_deg, largest_mm):
+def test_markers_give_the_poses_and_help_features(pear, free, method, largest_deg, largest_mm):
     images, names, truth, intrinsics = pear
-    poses = find_poses(images, names, pear_info(), method, from_features=from_features)
+    poses = find_poses(images, names, pear_info(), method, from_features=partial(poses_from_features, free=free))
     assert poses.method == {"auto": "markers"}.get(method, method)
     assert poses.metric
     assert poses.used.all()
@@ -65,8 +65,9 @@ def test_markers_give_the_poses_and_help_features(pear, from_features, method, l
 
 
 @pytest.mark.slow
-def test_without_markers_and_a_known_distance_there_is_no_scale(pear, from_features):
+def test_without_markers_and_a_known_distance_there_is_no_scale(pear, free):
     images, names, truth, _ = pear
+    few = replace(free, tracks=free.tracks.select(free.tracks.point % 4 == 0))  # which are faster
     # The session's markers are of another dictionary.
     by_hand = pear_info(
         marker_side_m=None,
@@ -74,15 +75,15 @@ def test_without_markers_and_a_known_distance_there_is_no_scale(pear, from_featu
         camera_distance_m=float(np.linalg.norm(truth[0, :2, 3])),
     )
     unknown = replace(by_hand, camera_distance_m=None)
-    options = {"method": "angles", "from_features": from_features}
-    metric, free = (find_poses(images, names, info, **options) for info in (by_hand, unknown))
+    options = {"method": "angles", "from_features": partial(poses_from_features, free=few)}
+    metric, unscaled = (find_poses(images, names, info, **options) for info in (by_hand, unknown))
     assert metric.method == "angles"
     np.testing.assert_allclose(metric.angles_deg, np.arange(FRAMES) * 360.0 / FRAMES, atol=1e-6)
     assert metric.metric
-    assert not free.metric
-    assert "poses-no-scale" in {finding.name for finding in free.findings}
+    assert not unscaled.metric
+    assert "poses-no-scale" in {finding.name for finding in unscaled.findings}
     assert "poses-no-scale" not in {finding.name for finding in metric.findings}
-    for poses, distance in ((metric, by_hand.camera_distance_m), (free, 1.0)):
+    for poses, distance in ((metric, by_hand.camera_distance_m), (unscaled, 1.0)):
         assert np.linalg.norm(poses.camera_to_world[0, :2, 3]) == pytest.approx(distance, rel=1e-6)
 
 

@@ -85,8 +85,8 @@ def test_points_that_err_together_in_their_frames_are_covered_by_their_scatter()
         tracks = point_tracks(true, noise_px=0.01, seed=seed)
         rng = np.random.default_rng(100 + seed)
         phase = 2.0 * true.angles_rad[tracks.frame] + rng.uniform(0.0, 2.0 * np.pi, 150)[tracks.point]
-        away_px = 0.1 * np.stack([np.cos(phase), np.sin(phase)], axis=-1)
-        tracks = replace(tracks, pixels=tracks.pixels + away_px)
+        offset_px = 0.1 * np.stack([np.cos(phase), np.sin(phase)], axis=-1)
+        tracks = replace(tracks, pixels=tracks.pixels + offset_px)
         problem = Problem(PointResiduals(true, tracks, 1e3, 0.01), free=FreeParameters(distance=False))
         found.append(scores(Adjusted(problem.minimise(true), problem), true)[0:3:2])
     assert 0.6 < np.sqrt((np.array(found) ** 2).mean()) < 1.45

@@ -25,6 +25,7 @@ from hsi_sc_nerf.poses.marker_observations import observe, observe_expected
 from hsi_sc_nerf.poses.session_pictures import (
     BAND_GROUPS_NM,
     GRAY,
+    GRAY_NM,
     FramePictures,
     SessionPictures,
     edge_precision,
@@ -39,7 +40,6 @@ from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.spectra import to_8_bit
 
 DICTIONARY = "DICT_5X5_50"
-GRAY_NM = (450.0, 700.0)
 
 
 def test_group_means_count_what_was_measured():
@@ -83,7 +83,7 @@ def test_what_was_not_measured_is_white_if_it_is_saturated_and_black_else(many_b
     frame = pictures_of(cube, wavelengths_nm, tmp_path)
     assert (frame.picture("red")[:10, :20] == 255).all()
     cv2.imwrite(str(tmp_path / "c.png"), np.zeros((80, 100), np.uint8))
-    frame = frame_pictures(tmp_path / "c.hdr", tmp_path / "c.png", frame.picture(GRAY), GRAY_NM)
+    frame = frame_pictures(tmp_path / "c.hdr", tmp_path / "c.png", frame.picture(GRAY))
     assert (frame.picture("red")[:10, :20] == 0).all()
 
 
@@ -152,7 +152,7 @@ def pictures_of(cube, wavelengths_nm, folder):
     cv2.imwrite(str(folder / "c.png"), flags)
     # As when the frame is packed: what is saturated has its clipped value.
     gray = np.nan_to_num(cube[..., bands(wavelengths_nm, *GRAY_NM)], nan=0.6).mean(axis=-1)
-    return frame_pictures(folder / "c.hdr", folder / "c.png", to_8_bit(gray), GRAY_NM)
+    return frame_pictures(folder / "c.hdr", folder / "c.png", to_8_bit(gray))
 
 
 @pytest.mark.slow

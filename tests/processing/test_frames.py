@@ -13,9 +13,9 @@ from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, PixelFlag, unpac
 from hsi_sc_nerf.processing.foreground_score import smoothed_bins
 from hsi_sc_nerf.processing.frames import FramePaths, process_frame, read_cache
 
-WAVELENGTHS_NM = np.array([450.0, 500.0, 550.0, 600.0, 650.0, 900.0])
+WAVELENGTHS_NM = np.array([440.0, 500.0, 550.0, 600.0, 650.0, 900.0])
 BANDS = len(WAVELENGTHS_NM)
-PICTURES = {"pseudo_rgb_nm": (600.0, 550.0, 450.0), "marker_range_nm": (490.0, 660.0)}
+PSEUDO_RGB_NM = (600.0, 550.0, 440.0)
 CALIBRATION = FrameCalibration(
     dark=np.full((1, BANDS), 100.0),
     gain=np.full((1, BANDS), 1 / 2000),
@@ -40,7 +40,7 @@ def cube(tmp_path):
 
 def process(cube, root, calibration=CALIBRATION, stamp="made"):
     paths = FramePaths.of(root, "frame")
-    return paths, process_frame(cube, calibration, paths, stamp, **PICTURES)
+    return paths, process_frame(cube, calibration, paths, stamp, pseudo_rgb_nm=PSEUDO_RGB_NM)
 
 
 def test_everything_is_written_upright(cube, tmp_path):

@@ -50,8 +50,8 @@ class TexturedBackground(Effect):
     ) -> Float[np.ndarray, "lines samples materials"]:
         """Fractions of ``materials`` in each pixel of the wall: boards with black joints and blotches of paint."""
         wood, blue, black = np.eye(3)
-        place = (np.arange(size_px) + 0.5) / size_px
-        y, x = (axis.ravel() for axis in np.meshgrid(place, place, indexing="ij"))
+        centres = (np.arange(size_px) + 0.5) / size_px
+        y, x = (axis.ravel() for axis in np.meshgrid(centres, centres, indexing="ij"))
         points = np.stack([x, y, np.zeros_like(x)], axis=-1)
         pattern = np.tile(wood, (size_px**2, 1))
         from_joint = np.abs((x * BOARDS + rng.uniform()) % 1.0 - 0.5) / BOARDS
