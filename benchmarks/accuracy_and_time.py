@@ -1,15 +1,15 @@
 """What accuracy costs in time: budgets, presets, one setting at a time, views and pictures, with three seeds.
 
     uv run python benchmarks/accuracy_and_time.py --output-dir /tmp/front
-    uv run python benchmarks/accuracy_and_time.py --output-dir /tmp/front --parts views
+    uv run python benchmarks/accuracy_and_time.py --output-dir /tmp/front --parts views --scene maize
 
 A simulated noisy session is trained for the same time with every setting, and judged against what is known:
 held-out views without the noise, the true surface, its area and volume. A row is the mean over the seeds and their
 range. Ranges that overlap are no difference. What is finished is not done again.
 
 Other work on the machine changes seconds by a third from hour to hour, and steps not at all. So the seconds of a step
-are measured once for all settings, in turns in one process, and each setting is trained for the steps that its time
-buys. ``--measure-again`` measures the seconds of a step anew, for the table alone.
+are measured once for all rows of a part, in turns in one process, and each row is trained for the steps that its time
+buys. Rows that train with the default settings on pictures of the default size have the default's step.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 import tyro
 from accuracy_front import DEFAULT, TITLES, draw_front, table_rows
-from beyond_the_paper import NOISE, SHADING, noise_free_metrics
+from beyond_the_paper import SHADING, noise_free_metrics
 from jaxtyping import Float
 from paper_tables import PaperTable
 from results_table import read_results, write_results
@@ -49,11 +49,12 @@ from hsi_sc_nerf.export.spectral_export import export_cloud
 from hsi_sc_nerf.files import read_json, write_json
 from hsi_sc_nerf.models.presets import ITERATIONS, PRESETS
 from hsi_sc_nerf.models.trained_run import open_run
-from hsi_sc_nerf.simulate.scene import load_scene
+from hsi_sc_nerf.simulate.effects.detector import ReadNoise
+from hsi_sc_nerf.simulate.scene import Fruit, load_scene
 from hsi_sc_nerf.simulate.scores import true_reference
 from hsi_sc_nerf.simulate.truth import load_truth
 
-Part = Literal["budgets", "settings", "presets", "views", "pictures"]
+Part = Literal["budgets", "settings", "presets", "views", "spacing", "pictures"]
 CLOUD_POINTS = 150_000
 STEPS_A_TURN = 10
 SETTLING_TURNS = 12
@@ -72,25 +73,35 @@ SETTINGS: dict[str, str] = {
     **{f"basis of {size}": f"{_MODEL}.basis-size {size}" for size in (4, 8, 16, 32)},
     "the paper's hash grid": f"{_MODEL}.match-resolution False",
     "first stage a quarter": "--full-frame.fraction 0.25 --masked.fraction 0.75",
+    "first stage three quarters": "--full-frame.fraction 0.75 --masked.fraction 0.25",
+    "twice the angular loss": f"{_MODEL}.angular-loss-mult 0.06",
     "no angular loss": f"{_MODEL}.angular-loss-mult 0",
     "the paper's losses": f"{_MODEL}.angular-loss cosine {_MODEL}.angular-loss-mult 0.25",
     "predicted normals": f"{_MODEL}.predict-normals True",
     "pose refinement": f"{_MODEL}.effects pose_refinement",
+    "view dependence": f"{_MODEL}.effects view_dependence",
+    "still chamber": f"{_MODEL}.effects still_chamber",
     "all three effects": f"{_MODEL}.effects view_dependence,still_chamber,pose_refinement",
     "no effects": f"{_MODEL}.effects none",
 }
 BUDGETS_S = (10, 20, 40, 80, 160)
 VIEWS = (8, 12, 20, 30, 60)
+SPACINGS: dict[str, dict[str, Any]] = {
+    "20 views": {"frames": 20},
+    "20 of 30 views": {"frames": 30, "motion": "{missing_frames: {count: 10}}"},
+    "20 views of half a turn": {"frames": 20, "motion": "{partial_turn: {span_deg: 180}}"},
+}
 PICTURES: dict[str, dict[str, int]] = {
-    "64 x 64 pixels": {"size": 64},
-    "256 x 256 pixels": {"size": 256},
-    "25 bands": {"bands": 25},
-    "51 bands": {"bands": 51},
-    "102 bands": {"bands": 102},
+    DEFAULT: {},
+    **{f"{size} x {size} pixels": {"size": size} for size in (64, 96, 192)},
+    **{
+        f"{paper.BANDS // binning} bands": {"bands": paper.BANDS // binning, "binning": binning}
+        for binning in (2, 4, 8)
+    },
 }
 
 BRUISE_M = 0.02
-"""Diameter of the bruise on the fruit of the part "views", whose area is measured as a trait."""
+"""Diameter of the bruise on a pear or apple of the parts "views" and "spacing", whose area is measured as a trait."""
 
 
 @dataclass(frozen=True)
@@ -109,44 +120,36 @@ class AccuracyAndTime(PaperTable):
     """Of the networks and the drawn pixels."""
     held_out_views: int | None = 3
     """Evaluate this many of the held-out views."""
-    parts: tuple[Part, ...] = ("budgets", "settings", "presets", "views", "pictures")
+    parts: tuple[Part, ...] = ("budgets", "settings", "presets", "views", "spacing", "pictures")
     """What is measured; none: only draw."""
     names: tuple[str, ...] = ()
     """Rows of the parts that are measured; all where none is named."""
-    measure_again: bool = False
-    """Measure the seconds of a step anew."""
     default_step_seconds: float | None = None
-    """Seconds of a step with the default settings, as measured in an earlier run; those of the other settings are
-    taken by their ratio to it, so that rows of several runs can be compared."""
+    """Seconds of a step with the default settings, as measured in an earlier run; those of the other rows are taken
+    by their ratio to it, so that rows of several runs can be compared."""
     bruised: tyro.conf.Suppress[bool] = False
-    """Whether the fruit has a bruise: that of the part "views"."""
+    """Whether a pear or apple has a bruise."""
+    motion: tyro.conf.Suppress[str] = ""
+    """Effect of the turntable as YAML, with which views are not evenly spaced over a turn."""
+    binning: tyro.conf.Suppress[int] = 1
+    """Bands of the sensor that make one of the session: their electrons, and their noise."""
     picture: Path | None = None
     """PNG file to draw the table to."""
 
     def main(self) -> None:
         """Do what is missing, write the table, draw it."""
-        data, _ = self._sessions()
-        kept = self.output_dir / "step_seconds.json"
-        if not kept.is_file():
-            write_json(kept, dict.fromkeys(("first", "last"), step_seconds(data, self.common, SETTINGS)))
-        elif self.measure_again:
-            write_json(kept, read_json(kept, "delete it") | {"last": step_seconds(data, self.common, SETTINGS)})
-        seconds = read_json(kept, "delete it to measure again")
-        if self.default_step_seconds is not None:
-            seconds = {
-                when: {name: self.default_step_seconds * one / found[DEFAULT] for name, one in found.items()}
-                for when, found in seconds.items()
-            }
         for part in self.parts:
-            rows = [row for row in self._rows(part, seconds["first"]) if not self.names or row[0] in self.names]
+            seconds = self._step_seconds(part)
+            rows = self._rows(part, seconds)
             found: dict[str, list[dict[str, float]]] = {name: [] for name, *_ in rows}
             for seed in self.seeds:
                 for name, command, words in rows:
                     judged = command.judged(name, words, seed)
-                    cost = seconds["last"][name if part == "settings" else DEFAULT]
+                    cost = seconds.get(name, seconds[DEFAULT])
                     found[name].append(judged | {"seconds": judged["steps"] * cost})
+            title = part if self.scene == "pear" else f"{part}, {self.scene}"
             write_results(
-                *("accuracy_and_time", TITLES, table_rows(part, found)),
+                *("accuracy_and_time", TITLES, table_rows(title, found)),
                 keys=2,
                 seed=f"scene, runs {' '.join(map(str, self.seeds))}",
                 folder=self.results,
@@ -154,37 +157,63 @@ class AccuracyAndTime(PaperTable):
         if self.picture is not None:
             draw_front(self.picture, read_results(self.results / "accuracy_and_time.csv")[1:])
 
+    def _step_seconds(self, part: Part) -> dict[str, float]:
+        """Seconds of a step of the default and of the part's rows that have another, by name."""
+        once = dict.fromkeys((DEFAULT, *SETTINGS, *PICTURES), 1.0)
+        differ = [row for row in self._rows(part, once) if row[0] != DEFAULT and part in ("settings", "pictures")]
+        if not differ and self.default_step_seconds is not None:
+            return {DEFAULT: self.default_step_seconds}
+        kept = self.output_dir / "step_seconds.json"
+        known = read_json(kept, "delete it to measure again") if kept.is_file() else {}
+        missing = {name: (command._sessions()[0], words) for name, command, words in differ if name not in known}
+        if missing or not known:
+            measured = step_seconds({DEFAULT: (self._sessions()[0], ""), **missing}, self.common)
+            scale = known.get(DEFAULT, measured[DEFAULT]) / measured[DEFAULT]
+            known = {name: scale * one for name, one in measured.items()} | known
+            write_json(kept, known)
+        scale = 1.0 if self.default_step_seconds is None else self.default_step_seconds / known[DEFAULT]
+        return {name: scale * one for name, one in known.items()}
+
     def _rows(self, part: Part, seconds: Mapping[str, float]) -> list[tuple[str, AccuracyAndTime, str]]:
-        """Name, options and words of each row."""
-        if part == "settings":
-            return [
-                (name, replace(self, iterations=round(self.train_seconds / seconds[name])), words)
-                for name, words in SETTINGS.items()
-            ]
-        usual = round(self.train_seconds / seconds[DEFAULT])
-        changes: Mapping[str, Mapping[str, int]] = {
+        """Name, options and words of each row that is asked for.
+
+        Args:
+            seconds: of a step, of the default and of each row of the parts "settings" and "pictures".
+        """
+        parts: Mapping[Part, Mapping[str, Mapping[str, Any]]] = {
+            "settings": {name: {} for name in SETTINGS},
             "budgets": {f"{budget} s": {"iterations": round(budget / seconds[DEFAULT])} for budget in BUDGETS_S},
             "presets": {name: {"iterations": preset[ITERATIONS]} for name, preset in PRESETS["cpu"].items()},
-            "views": {
-                f"{frames} views": {"frames": frames, "iterations": usual, "bruised": True} for frames in VIEWS
-            },
-            "pictures": {name: {**change, "iterations": usual} for name, change in PICTURES.items()},
-        }[part]
-        return [(name, replace(self, **change), "") for name, change in changes.items()]  # type: ignore[arg-type]
+            "views": {f"{frames} views": {"frames": frames, "bruised": True} for frames in VIEWS},
+            "spacing": {name: {**change, "bruised": True} for name, change in SPACINGS.items()},
+            "pictures": PICTURES,
+        }
+        rows = []
+        for name, change in parts[part].items():
+            if name in self.names or not self.names:
+                own = seconds[name] if part in ("settings", "pictures") else seconds[DEFAULT]
+                command = replace(self, **{"iterations": round(self.train_seconds / own), **change})
+                rows.append((name, command, SETTINGS[name] if part == "settings" else ""))
+        return rows
 
     def _sessions(self) -> tuple[Path, Path]:
         """Dataset of the noisy session; folder of all that belongs to it."""
-        folder = self.output_dir / f"{self.size}-{self.bands}-{self.frames}{'-bruised' * self.bruised}"
+        kind = f"{self.scene}-{self.size}-{self.bands}-{self.frames}{'-bruised' * self.bruised} {self.motion}"
+        folder = self.output_dir / _folder_name(kind)
         scene = load_scene(self.scene)
-        if self.bruised:
+        if self.bruised and isinstance(scene.object, Fruit):
             scene = replace(scene, object=replace(scene.object, bruise_diameter_m=BRUISE_M))
-        self.simulated(scene, folder / "noise-free", SHADING)
-        return self.simulated(scene, folder / "session", (*NOISE, *SHADING)), folder
+        full_well = scene.sensor.full_well_electrons * self.binning
+        scene = replace(scene, sensor=replace(scene.sensor, full_well_electrons=full_well))
+        read_noise = f"{{read_noise: {{electrons: {ReadNoise().electrons * self.binning**0.5:.1f}}}}}"
+        always = (*SHADING, self.motion) if self.motion else SHADING
+        self.simulated(scene, folder / "noise-free", always)
+        return self.simulated(scene, folder / "session", ("photon_noise", read_noise, *always)), folder
 
     def judged(self, name: str, words: str, seed: int) -> dict[str, float]:
         """Figures of one run."""
         data, folder = self._sessions()
-        folder_name = re.sub("[^a-z0-9]+", "-", name) if words else DEFAULT
+        folder_name = _folder_name(name) if words else DEFAULT
         runs = folder / f"runs-{self.iterations}-{seed}"
         (run,) = self.trained([own_configuration(f"{folder_name}={words}")], data, runs, seed)
         kept = runs / run.name / "judged.json"
@@ -198,12 +227,21 @@ class AccuracyAndTime(PaperTable):
         return read_json(kept, "delete it to judge the run again")
 
 
-def step_seconds(data: Path, common: str, settings: Mapping[str, str]) -> dict[str, float]:
-    """Processor seconds of a step with each setting: in turns, so that other work on the machine meets all alike."""
+def _folder_name(text: str) -> str:
+    return re.sub("[^a-z0-9]+", "-", text).strip("-")
+
+
+def step_seconds(runs: Mapping[str, tuple[Path, str]], common: str) -> dict[str, float]:
+    """Processor seconds of a step of each run: in turns, so that other work on the machine meets all alike.
+
+    Args:
+        runs: dataset and words of each, by name.
+        common: words of all.
+    """
     torch.set_num_threads(1)
     with TemporaryDirectory() as temporary:
-        trainers = {}
-        for name, words in settings.items():
+        trainers: dict[str, Any] = {}
+        for name, (data, words) in runs.items():
             all_words = tuple(split_words(f"{common} {words}"))
             folder = str(Path(temporary, str(len(trainers))))
             job = Job("hsi-sc-nerf", all_words, str(data), folder, 10_000, None, "cpu", (), 1, None)

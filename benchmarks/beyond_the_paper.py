@@ -18,19 +18,23 @@ from pathlib import Path
 import numpy as np
 import torch
 import tyro
+from jaxtyping import Bool, Float
 from paper_tables import METRICS, PaperTable, mean_and_deviation
 from results_table import write_results
+from torch import Tensor
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.benchmark.configurations import named_configuration
 from hsi_sc_nerf.benchmark.run import BenchmarkRun, HeldOutViews
 from hsi_sc_nerf.benchmark.steps import run_step, typed_command
+from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.evaluation.comparison import CompareConfig, read_surface
 from hsi_sc_nerf.evaluation.spatial import Surface, score_at
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_metrics
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.packed.dataset import open_packed
+from hsi_sc_nerf.processing.frames import FramePaths
 from hsi_sc_nerf.simulate.scores import score_processing, true_reference
 from hsi_sc_nerf.simulate.truth import load_truth
 
@@ -106,17 +110,25 @@ def noise_free_metrics(config: Path, noise_free: Path, held_out_views: int | Non
     pipeline.eval()
     manager = pipeline.datamanager
     frames = manager.eval_dataset.metadata["frames"]
-    clean = {frame.capture: frame for frame in open_packed(noise_free).frames}
     found: list[dict[str, float]] = []
     for camera, batch in HeldOutViews(manager.fixed_indices_eval_dataloader, held_out_views):
         with torch.no_grad():
             rendered = pipeline.model.get_outputs_for_camera(camera)["spectral"]
-        reflectance, valid = map(torch.from_numpy, unpack(clean[frames[batch["image_idx"]].capture].cube()[:]))
+        reflectance, valid = reflectance_of(noise_free, frames[batch["image_idx"]].capture)
         mask = batch["mask"][..., 0].bool()
         for prefix, image in (("clean_", rendered.cpu()), ("noise_", batch["spectral"])):
             metrics = spectral_metrics(image, reflectance, mask, valid)
             found.append({prefix + name: metrics[name] for name in METRICS})
     return {name: float(np.mean([view[name] for view in found if name in view])) for name in found[0] | found[1]}
+
+
+def reflectance_of(data: Path, capture: str) -> tuple[Float[Tensor, "h w bands"], Bool[Tensor, "h w bands"]]:
+    """Reflectance of a capture, and which of its values are measurements.
+
+    A frame that `process` finds no pose for is not in ``transforms.json``, but it is calibrated like the others.
+    """
+    reflectance, valid = unpack(open_cube(FramePaths.of(data, capture).cube).memmap()[:])
+    return torch.from_numpy(reflectance), torch.from_numpy(valid)
 
 
 def cloud_scores(config: Path, folder: Path, output_dir: Path) -> dict[str, float]:

@@ -4,15 +4,20 @@ import os
 import random
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from beyond_the_paper import reflectance_of
+from capture_factory import INFO, frame_reflectance, true_poses, write_session
 from damaged_files import damaged, run_kind
 from file_kinds import Kind, kinds
 from results_table import RESULTS, SOURCE_COLUMNS, read_results, write_results
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.packed.dataset import open_packed
+from hsi_sc_nerf.processing.process import process_session
 
 COLUMNS = ["object", "method", "error, mm"]
 OLD = {"commit": "aaaaaaa", "machine": "old machine", "seed": "1"}
@@ -123,6 +128,19 @@ def test_nine_wavelengths_give_all_spectra_and_the_drift_ends_where_it_is_said()
         np.testing.assert_allclose(sides_m, path_traced_scene.MARKER_SIDE_M)
         # Clockwise for who looks from above.
         assert np.cross(corners[1] - corners[0], corners[2] - corners[1])[2] < 0
+
+
+@pytest.mark.slow
+def test_a_frame_without_a_pose_has_noise_free_reflectance(tmp_path):
+    """At 64 px a frame of the noise-free session shows no marker that can be read, and the noisy one does."""
+    session = write_session(tmp_path / "session", info=INFO)
+    data = process_session(
+        session, tmp_path / "data", progress=False, estimate_poses=partial(true_poses, unused=("ball_2",))
+    )
+    assert "ball_2" not in {frame.capture for frame in open_packed(data).frames}
+    reflectance, valid = reflectance_of(data, "ball_2")
+    np.testing.assert_allclose(reflectance[valid], frame_reflectance(90.0)[valid], atol=0.01)
+    assert valid.all()
 
 
 STAND_INS = Path(__file__).parents[1] / "benchmarks" / "gpu_stand_ins"

@@ -106,3 +106,15 @@ def test_inspect_quotes_the_committed_figures_of_views():
             quoted = ACCURACY_BY_VIEWS[int(name.split()[0])]
             volume, bruise = map(abs, measured[2:])
             assert quoted == (round(100.0 * measured[0], 1), round(measured[1]), round(volume, 1), round(bruise))
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/validation/accuracy_and_time.md"])
+def test_the_errors_of_the_presets_in_a_page_are_the_committed_ones(page):
+    titles, *rows = documentation.read_results(documentation.RESULTS / "accuracy_and_time.csv")
+    columns = [titles.index(title) for title in ("without the noise: SAM", " RMSE")]
+    texts = (ROOT / page).read_text(encoding="utf-8").split("\n\n")
+    words = ("fast`", "`balanced`", "`best`", "SAM")
+    (paragraph,) = (text for text in texts if all(word in text for word in words))
+    measured = {row[column].split()[0] for row in rows if row[0] == "presets" for column in columns}
+    # SAM of a run of minutes is between 0.005 and 0.02 rad; other figures of the paragraph have fewer digits.
+    assert {*re.findall(r"0\.0[01]\d\d", paragraph)} == measured

@@ -1,29 +1,19 @@
 """Runs by iterations and by the clock, and clocks that pause."""
 
 import pytest
+from clock_by_hand import Time, time_by_hand
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.models import schedule as module
 from hsi_sc_nerf.models.schedule import Schedule, TrainingClock
 from hsi_sc_nerf.models.stages import StageConfig, plan_seconds, plan_stages
 
 CONFIGS = (StageConfig("a", 1.0, learn_after={"camera_opt": 0.5}), StageConfig("b", 3.0, lr_start=0.5, lr_end=0.02))
 
 
-class Time:
-    """A clock that is moved by hand."""
-
-    now = 100.0
-
-    def __call__(self):
-        return self.now
-
-
 @pytest.fixture
 def timed(monkeypatch):
     """Makes schedules of eight seconds, whose clock is the returned one."""
-    time = Time()
-    monkeypatch.setattr(module.TrainingClock.__init__, "__defaults__", (lambda: None, 0.0, time, time))
+    time = time_by_hand(monkeypatch)
     return time, lambda clock="wall": Schedule(plan_seconds(CONFIGS, 8.0), clock)
 
 

@@ -5,6 +5,7 @@ from unittest.mock import Mock
 
 import pytest
 import torch
+from clock_by_hand import time_by_hand
 from nerfstudio.utils import profiler
 from scipy.ndimage import distance_transform_edt
 from small_trainer import STEPS, trainer
@@ -201,19 +202,35 @@ def test_a_full_disk_leaves_the_earlier_checkpoint(tiny_dataset, tmp_path, monke
 
 
 @pytest.mark.slow
-def test_a_timed_run_ends_by_the_clock_and_goes_on_from_its_checkpoint(tiny_dataset, tmp_path):
-    made = trainer(tiny_dataset, tmp_path / "first", max_train_seconds=1.0)
-    made.train()
+def test_a_timed_run_ends_by_the_clock_and_goes_on_from_its_checkpoint(tiny_dataset, tmp_path, monkeypatch):
+    time = time_by_hand(monkeypatch)
+
+    def timed_trainer(name, **changes):
+        """Of steps of an eighth of a second, with an evaluation of 100 s after each stage."""
+        made = trainer(tiny_dataset, tmp_path / name, evaluate_stages=True, **changes)
+
+        def step_of(step, next_train=made.pipeline.datamanager.next_train):
+            time.now += 0.125
+            return next_train(step)
+
+        def evaluation(**options):
+            time.now += 100.0
+            return {"psnr": 20.0}
+
+        made.pipeline.datamanager.next_train = step_of
+        made.pipeline.get_average_eval_image_metrics = evaluation
+        made.train()
+        return made, torch.load(max(made.checkpoint_dir.glob("*.ckpt")))
+
+    made, state = timed_trainer("first", max_train_seconds=1.0)
     assert {path.name for path in made.base_dir.glob("stage-*")} == {"stage-full-frame", "stage-masked"}
-    state = torch.load(max(made.checkpoint_dir.glob("*.ckpt")))
-    assert state["training"]["position"] >= 1.0
-    assert state["step"] == made._trained_step
-    longer = trainer(tiny_dataset, tmp_path / "longer", max_train_seconds=6.0, load_dir=made.checkpoint_dir)
-    longer.train()
-    later = torch.load(max(longer.checkpoint_dir.glob("*.ckpt")))
-    assert later["training"]["position"] > state["training"]["position"]
+    assert state["training"]["position"] == 1.0
+    assert state["step"] == made._trained_step == 7
+    _, later = timed_trainer("longer", max_train_seconds=6.0, load_dir=made.checkpoint_dir)
+    # The second stage began after half a second, and now takes three.
+    assert later["training"]["position"] == 3.5
     assert later["training"]["completed_stage"] == "masked"
-    assert later["step"] > state["step"]
+    assert later["step"] == 27
     with pytest.raises(SystemExit, match=r"hsi-sc-nerf: [^\n]*--max-num-iterations"):
         trainer(tiny_dataset, tmp_path / "other", load_dir=made.checkpoint_dir)
 
