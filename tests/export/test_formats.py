@@ -1,4 +1,6 @@
+import resource
 import sys
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -93,6 +95,27 @@ def test_what_breaks_off_leaves_what_was_there(tmp_path: Path, file_format) -> N
         write_cloud(
             tmp_path / "cloud", CloudStream(40, WAVELENGTHS_NM, ("opacity", "views"), breaking_off()), file_format
         )
+    assert list(tmp_path.iterdir()) == [before]
+    assert sum(file.stat().st_size for file in tmp_path.rglob("*")) == size
+
+
+@pytest.fixture
+def limit_of_files() -> Iterator[Callable[[int], None]]:
+    """Sets a limit to the size of files, which stands for a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("room_bytes", [0, 5000])
+@pytest.mark.parametrize("file_format", ["ply", "las", "netcdf", "zarr"])
+def test_a_full_disk_is_one_sentence_and_leaves_what_was_there(tmp_path, file_format, room_bytes, limit_of_files):
+    before = write_cloud(tmp_path / "cloud", stream(random_cloud(COUNT)), file_format)
+    size = sum(file.stat().st_size for file in tmp_path.rglob("*"))
+    limit_of_files(room_bytes)
+    with pytest.raises(InputError, match=r"cannot be written \(.*\); free some space"):
+        write_cloud(tmp_path / "cloud", stream(random_cloud(9000)), file_format)
     assert list(tmp_path.iterdir()) == [before]
     assert sum(file.stat().st_size for file in tmp_path.rglob("*")) == size
 
