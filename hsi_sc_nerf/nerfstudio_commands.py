@@ -45,7 +45,7 @@ _EXPORTED = (
     *("transforms_train.json", "transforms_eval.json"),
 )
 """Files that nerfstudio's exports write, and do not write whole."""
-_FULL_BYTES = 1 << 16
+_FULL_BYTES = 1 << 12
 """A disk with less free is full."""
 _PICTURES = ("gt-rgb", "rgb", "accumulation", "depth", "expected_depth")
 """Outputs that are pictures, which ``ns-render dataset`` writes if it is given no names."""

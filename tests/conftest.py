@@ -1,6 +1,7 @@
 import fcntl
 import gc
 import os
+import resource
 import signal
 import sys
 from pathlib import Path
@@ -60,6 +61,15 @@ def ctrl_c():
     handler = signal.getsignal(signal.SIGINT)
     yield
     signal.signal(signal.SIGINT, handler)
+
+
+@pytest.fixture
+def limit_of_files(monkeypatch):
+    """Sets a limit to the size of files in bytes, which stands for a full disk, until the test ends."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # Python would keep the beginning of a compiled module
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.fixture(scope="session", params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -45,6 +46,7 @@ from hsi_sc_nerf.models.training_watch import (
     RisenLossGuard,
     TrainingDivergedError,
     end_diverged_run,
+    files_of_run,
     flush_logs,
     non_finite_names,
     stage_summary,
@@ -178,15 +180,17 @@ class StagedTrainer(Trainer):
     def train(self) -> None:
         """Train the remaining steps of the plan; nerfstudio would add ``max_num_iterations`` to a resumed run."""
         try:
-            with one_sentence(), interruption.one_line(self._stopped):
+            with one_sentence(), interruption.one_line(self._stopped), files_of_run(self.base_dir):
                 self._train()
+                flush_logs()
             interruption.ignore_when_done()
         except TrainingDivergedError as error:
             # Skipped steps do not change the weights: unless the loss had risen before, they are still good.
             self.save_checkpoint(self.step)
             end_diverged_run(error, self.checkpoint_dir)
         finally:
-            flush_logs()
+            with suppress(OSError):  # what went wrong before is told
+                flush_logs()
 
     def _train(self) -> None:
         if self._loaded is not None and self._keep_stage_of(self._loaded) and self.schedule.complete:

@@ -20,6 +20,7 @@ from nerfstudio.utils.profiler import PROFILER
 from rich.progress import TextColumn
 from torch import Tensor
 
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.models.schedule import Schedule
 from hsi_sc_nerf.models.stages import Stage
 from hsi_sc_nerf.terminal import timed_progress
@@ -161,6 +162,22 @@ def flush_logs() -> None:
     for event_writer in writer.EVENT_WRITERS:
         if isinstance(event_writer, writer.TensorboardWriter):
             event_writer.tb_writer.flush()
+
+
+@contextmanager
+def files_of_run(folder: Path) -> Iterator[None]:
+    """In the block, a file that the system refuses, such as the logs on a full disk, is one sentence.
+
+    Raises:
+        InputError: there was one.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            f"{error.filename or folder}: cannot be read or written ({error.strerror or error}); mend that, or free "
+            "some space, and resume with --load-dir."
+        ) from error
 
 
 def stopped_run(checkpoints: Path) -> str:

@@ -1,6 +1,4 @@
-import resource
 import sys
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -97,14 +95,6 @@ def test_what_breaks_off_leaves_what_was_there(tmp_path: Path, file_format) -> N
         )
     assert list(tmp_path.iterdir()) == [before]
     assert sum(file.stat().st_size for file in tmp_path.rglob("*")) == size
-
-
-@pytest.fixture
-def limit_of_files() -> Iterator[Callable[[int], None]]:
-    """Sets a limit to the size of files, which stands for a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.mark.slow
