@@ -210,8 +210,8 @@ def test_a_disk_that_fills_up_in_training_is_one_sentence(
     """No file fits, or the beginning of the logs does."""
     monkeypatch.setattr(writer, "EVENT_WRITERS", [])  # what has failed once fails in the runs after it
     made = trainer(tiny_dataset, tmp_path)
-    limit_of_files(room_bytes)
-    with pytest.raises(SystemExit, match=r"^hsi-sc-nerf: [^\n]*free some space[^\n]*\.$"):
+    told = r"^hsi-sc-nerf: [^\n]*free some space[^\n]*\.$"
+    with limit_of_files(room_bytes), pytest.raises(SystemExit, match=told):
         made.train()
     assert list(made.base_dir.rglob("*.ckpt")) == []
 

@@ -64,8 +64,8 @@ def test_what_cannot_be_printed_is_refused_in_a_sentence(options, message) -> No
 
 def test_a_full_disk_is_one_sentence(tmp_path, limit_of_files) -> None:
     sheets = marker_sheets(0.02, "DICT_5X5_50", range(4))
-    limit_of_files(100)
-    with pytest.raises(InputError, match=r"markers\.pdf: cannot be written .*free some space"):
+    told = r"markers\.pdf: cannot be written .*free some space"
+    with limit_of_files(100), pytest.raises(InputError, match=told):
         write_marker_sheets(tmp_path / "markers.pdf", sheets)
     assert not list(tmp_path.iterdir())
 
