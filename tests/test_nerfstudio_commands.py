@@ -99,6 +99,20 @@ def _with_other_names(config_path):
     (config_path.parent / "nerfstudio_models" / "step-best.ckpt").write_bytes(b"")
 
 
+class _Executes:
+    """What an unsafe loader of pickles would execute: a folder is made."""
+
+    def __init__(self, folder):
+        self.folder = folder
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.folder),)
+
+
+def _that_executes(config_path):
+    with_checkpoint(config_path, pipeline=_Executes(config_path.parent / "executed"))
+
+
 NO_RUNS = {
     "no file": (lambda path: path.unlink(), "there is no such file"),
     "empty": (_empty, "cannot be read"),
@@ -117,6 +131,7 @@ NO_RUNS = {
         lambda path: with_checkpoint(path, pipeline={"a": 1}),
         "is no checkpoint of a model",
     ),
+    "checkpoint that executes": (_that_executes, "is not a readable checkpoint"),
     "stray file": (_with_stray_file, "notes.txt: is no checkpoint, and nerfstudio takes it for one; move it"),
 }
 

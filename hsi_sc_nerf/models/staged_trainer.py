@@ -145,7 +145,7 @@ class StagedTrainer(Trainer):
         self._captured: CapturedSteps | None = None
         self.stop_training = False  # nerfstudio sets it when the training begins; single steps read it too
         try:
-            with one_sentence(), interruption.one_line(self._stopped):
+            with one_sentence(), interruption.one_line(self._stopped), files_of_run(self.base_dir):
                 self._loaded = resume_effects(self.config)
                 super().setup(test_mode)
         except SystemExit:
@@ -238,7 +238,7 @@ class StagedTrainer(Trainer):
         self.schedule.end_step(step)
         self._trained_step = step
         self.stop_training |= self.schedule.complete
-        self._risen_loss.record(step, self.schedule, float(loss))
+        self._risen_loss.record(step, self.schedule, float(loss.detach()))
         return loss, loss_dict, metrics_dict
 
     def _captured_iteration(self, steps: CapturedSteps, step: int) -> TRAIN_INTERATION_OUTPUT:

@@ -7,6 +7,7 @@ above what it was and stays there.
 from __future__ import annotations
 
 import math
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -171,9 +172,13 @@ def files_of_run(folder: Path) -> Iterator[None]:
     Raises:
         InputError: there was one.
     """
+    hook = threading.excepthook
+    # The thread that writes the logs raises in this one as well.
+    threading.excepthook = lambda raised: None if isinstance(raised.exc_value, OSError) else hook(raised)
     try:
         yield
-    except OSError as error:
+        threading.excepthook = hook
+    except OSError as error:  # that thread may be about to tell of it
         raise InputError(
             f"{error.filename or folder}: cannot be read or written ({error.strerror or error}); mend that, or free "
             "some space, and resume with --load-dir."
