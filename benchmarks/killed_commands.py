@@ -276,7 +276,9 @@ def main(
         if not (inputs / "session").is_dir():
             simulated(inputs / "session")
             undisturbed(commands(inputs)[0], Path(temporary) / "first")  # compiles what the others find
-        for command in commands(inputs):
+        every = commands(inputs)
+        last = max(number for number, command in enumerate(every) if only in command.name)
+        for command in every[: last + 1]:
             if only not in command.name and (inputs / command.name).is_dir():
                 continue
             shutil.rmtree(inputs / command.name, ignore_errors=True)
