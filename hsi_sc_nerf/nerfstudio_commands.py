@@ -116,7 +116,8 @@ def _nothing_half_exported(command: Any) -> Iterator[None]:
         InputError: the disk is full.
     """
     folder = getattr(command, "output_dir", None) or getattr(command, "output_path", None)
-    started, failure = time.time(), None
+    started = time.time()
+    failure: Exception | None = None
     try:
         yield
     except InputError:

@@ -87,9 +87,7 @@ def test_every_hard_case_says_what_happens_and_names_a_test():
 
 def test_every_test_that_a_page_names_is_there():
     named = {
-        found
-        for page in PAGES
-        for found in re.findall(r"`([a-z_/]+)::(test_\w+)`", page.read_text(encoding="utf-8"))
+        found for page in PAGES for found in re.findall(r"`([a-z_/]+)::(test_\w+)`", page.read_text(encoding="utf-8"))
     }
     assert len(named) > 100
     for module, name in named:

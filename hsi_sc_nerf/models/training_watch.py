@@ -173,8 +173,12 @@ def files_of_run(folder: Path) -> Iterator[None]:
         InputError: there was one.
     """
     hook = threading.excepthook
-    # The thread that writes the logs raises in this one as well.
-    threading.excepthook = lambda raised: None if isinstance(raised.exc_value, OSError) else hook(raised)
+
+    def tell(raised: threading.ExceptHookArgs) -> None:
+        if not isinstance(raised.exc_value, OSError):  # the thread that writes the logs raises in this one as well
+            hook(raised)
+
+    threading.excepthook = tell
     try:
         yield
         threading.excepthook = hook
