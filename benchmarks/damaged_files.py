@@ -5,7 +5,8 @@
 Valid files are damaged at random: bytes are changed, parts are cut out, doubled or cut off, numbers and texts are
 replaced by such as break programs, values of JSON by others. Each damaged file is read as the commands read it.
 Counted are `InputError`, reading without error, any other exception, reading for more than `SLOW_S` of processor
-time, and memory beyond what a small file could hold. Inputs that did any of the last three are kept in --keep.
+time, and memory beyond what a small file could hold. Inputs that did any of the last three are kept in --keep. With
+--progress, a run that was interrupted goes on with the next input.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from file_kinds import Kind, kinds
 from results_table import RESULTS, read_results, write_results
 
 from hsi_sc_nerf.errors import LONGEST_MESSAGE, InputError
+from hsi_sc_nerf.files import write_json
 
 COLUMNS = ["kind of file", "inputs", "refused in one sentence", "read", "other exception", "slow", "much memory"]
 SLOW_S = 2.0
@@ -62,10 +64,27 @@ class Outcome:
     counts: Counter[str] = field(default_factory=Counter)
     errors: Counter[str] = field(default_factory=Counter)
 
+    @property
+    def inputs(self) -> int:
+        """Their number."""
+        return self.counts.total() - self.counts["slow"] - self.counts["memory"]
+
     def row(self, name: str) -> list[str]:
         """The line of the table."""
         shown = [str(self.counts[key]) for key in ("refused", "read", "other", "slow", "memory")]
-        return [name, str(self.counts.total() - self.counts["slow"] - self.counts["memory"]), *shown]
+        return [name, str(self.inputs), *shown]
+
+    def save(self, path: Path) -> None:
+        """Keep what was counted."""
+        write_json(path, {"counts": self.counts, "errors": self.errors})
+
+    @classmethod
+    def saved(cls, path: Path | None) -> Outcome:
+        """What `save` kept; nothing where there is no such file."""
+        if path is None or not path.is_file():
+            return cls()
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return cls(Counter(content["counts"]), Counter(content["errors"]))
 
 
 class TooSlowError(BaseException):
@@ -146,13 +165,15 @@ def _containers(values: Any) -> Iterator[Any]:
             waiting += one.values() if isinstance(one, dict) else one
 
 
-def run_kind(kind: Kind, inputs: int, seed: int, keep: Path | None = None) -> Outcome:
-    """Damage a kind's file ``inputs`` times, read it, and leave the valid file."""
-    outcome, valid = Outcome(), kind.path.read_bytes()
-    rng = random.Random(f"{seed} {kind.name}")
+def run_kind(kind: Kind, inputs: int, seed: int, keep: Path | None = None, progress: Path | None = None) -> Outcome:
+    """Damage a kind's file ``inputs`` times, read it, and leave the valid file; some may have been done already."""
+    outcome, valid = Outcome.saved(progress), kind.path.read_bytes()
+    done, rng = outcome.inputs, random.Random(f"{seed} {kind.name}")
     try:
         for number in range(inputs):
             content = (overwritten if kind.same_length else damaged)(valid, rng)
+            if number < done:
+                continue
             kind.path.write_bytes(content)
             before_mb, started = _peak_mb(), _processor_s()
             said, told = _outcome(kind.read)
@@ -167,6 +188,8 @@ def run_kind(kind: Kind, inputs: int, seed: int, keep: Path | None = None) -> Ou
             if keep is not None and (said == "other" or took_s > SLOW_S or more_mb > MUCH_MEMORY_MB):
                 keep.mkdir(parents=True, exist_ok=True)
                 (keep / f"{kind.name.replace(' ', '_')}-{number}{kind.path.suffix}").write_bytes(content)
+            if progress is not None:
+                outcome.save(progress)
     finally:
         kind.path.write_bytes(valid)
     return outcome
@@ -221,7 +244,12 @@ def _processor_s() -> float:
 
 
 def main(
-    inputs: int = 100_000, seed: int = 0, only: str = "", keep: Path | None = None, results: Path = RESULTS
+    inputs: int = 100_000,
+    seed: int = 0,
+    only: str = "",
+    keep: Path | None = None,
+    progress: Path | None = None,
+    results: Path = RESULTS,
 ) -> None:
     """Damage and read files of every kind, and write the table.
 
@@ -230,6 +258,7 @@ def main(
         seed: of the damages.
         only: part of the names of the kinds to run, each with its fraction of inputs; other rows are kept.
         keep: folder for inputs that were neither refused nor read in time and memory.
+        progress: folder for what was counted so far, after each input; of the same inputs and seed.
         results: folder of the table.
     """
     with tempfile.TemporaryDirectory() as temporary:
@@ -243,7 +272,8 @@ def main(
         weights, rows = sum(kind.weight for kind in every_kind), []
         for kind in found:
             started = time.monotonic()
-            outcome = run_kind(kind, round(inputs * kind.weight / weights), seed, keep)
+            counted = None if progress is None else progress / f"{kind.name.replace('/', '_')}.json"
+            outcome = run_kind(kind, round(inputs * kind.weight / weights), seed, keep, counted)
             rows.append(outcome.row(kind.name))
             print(f"{kind.name}: {time.monotonic() - started:.0f} s, {dict(outcome.counts)}", flush=True)
             for told, count in outcome.errors.most_common(12):
@@ -254,8 +284,8 @@ def main(
             {row[0]: row[: len(COLUMNS)] for row in read_results(results / "damaged_files.csv")[1:]} if only else {}
         )
         merged = kept | {row[0]: row for row in rows}
-        counted = [merged[kind.name] for kind in every_kind if kind.name in merged]
-        total = ["all", *(str(sum(int(row[i]) for row in counted)) for i in range(1, len(COLUMNS)))]
+        together = [merged[kind.name] for kind in every_kind if kind.name in merged]
+        total = ["all", *(str(sum(int(row[i]) for row in together)) for i in range(1, len(COLUMNS)))]
         write_results("damaged_files", COLUMNS, [*rows, total], keys=bool(only), seed=str(seed), folder=results)
 
 

@@ -11,13 +11,15 @@ bytes as the undisturbed run; checkpoints are compared tensor by tensor, bit by 
 folder that was loaded. TensorBoard's logs are not compared, for they hold times, and each start adds one; nor are
 the speeds among the metrics of a stage. A file is half-written if it lies under its final name, has not the
 reference's bytes, and cannot be read as JSON, PNG, checkpoint or settings. A moment that comes after the command's
-end, which differs from run to run, is drawn again for a shorter duration.
+end, which differs from run to run, is drawn again for a shorter duration. All durations are processor time of the
+command, so that other work on the machine changes neither the moments nor what is taken for "goes on". Linux alone.
 """
 
 from __future__ import annotations
 
 import os
 import random
+import resource
 import shutil
 import signal
 import subprocess
@@ -38,7 +40,7 @@ from hsi_sc_nerf.simulate.session import simulate_session
 
 KILLED = [
     "command",
-    "undisturbed, s",
+    "undisturbed, processor s",
     "moments",
     "runs to the end",
     "half-written files",
@@ -49,8 +51,9 @@ STOPPED = ["command", "moments", "130 and one line", "ends otherwise", "goes on"
 STEPS, RAYS = 120, 128
 KILLS_IN_A_ROW = 4
 TRAINED = Path("e", "hsi-sc-nerf", "run")
-# A command that still runs so long after Ctrl-C has swallowed it, unless it had been done and takes long to end.
-_ENDS_S, _WAS_ENDING_S = 10.0, 60.0
+# A command that uses so much processor time after Ctrl-C, or waits so long, has swallowed it.
+_ENDS_S, _HANGS_S = 10.0, 600.0
+_LOOK_EVERY_S = 0.01
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,7 @@ def commands(inputs: Path) -> list[Command]:
 
 @dataclass(frozen=True)
 class Moment:
-    """Seconds after a command's start, or after its first file."""
+    """Processor time after a command's start, or after its first file."""
 
     after_s: float
     writing: bool
@@ -95,12 +98,15 @@ class Moment:
     def comes(self, process: subprocess.Popen[bytes], folder: Path) -> bool:
         """Wait for it; False if the process ended before."""
         before = state_of(folder)
-        while self.writing and process.poll() is None and state_of(folder) == before:
-            time.sleep(0.01)
-        try:
-            process.wait(self.after_s)
-        except subprocess.TimeoutExpired:
-            return True
+        while self.writing and state_of(folder) == before:
+            if process.poll() is not None:
+                return False
+            time.sleep(_LOOK_EVERY_S)
+        begun_s = processor_s(process) if self.writing else 0.0
+        while process.poll() is None:
+            if processor_s(process) - begun_s >= self.after_s:
+                return True
+            time.sleep(_LOOK_EVERY_S)
         return False
 
     def shorter(self) -> Moment:
@@ -132,20 +138,29 @@ def start(words: tuple[str, ...], folder: Path) -> subprocess.Popen[bytes]:
         )
 
 
+def processor_s(process: subprocess.Popen[bytes]) -> float:
+    """Processor time that a process has used; the last of it stays readable until its end is asked for."""
+    fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 def undisturbed(command: Command, folder: Path) -> tuple[float, float]:
-    """Run a command; its seconds until its first file and until its end.
+    """Run a command; its processor time until its first file and until its end.
 
     Raises:
         RuntimeError: it failed.
     """
-    started = time.monotonic()
-    process = start(command.words, folder)
-    while process.poll() is None and not files_in(folder / "out"):
-        time.sleep(0.005)
-    first_file_s = time.monotonic() - started
+    process, first_file_s = start(command.words, folder), 0.0
+    while not files_in(folder / "out"):
+        first_file_s = processor_s(process)
+        if process.poll() is not None:
+            break
+        time.sleep(_LOOK_EVERY_S)
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     if process.wait() != 0:
         raise RuntimeError(f"{command.name}: {(folder / 'log').read_text()[-2000:]}")
-    return first_file_s, time.monotonic() - started
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return first_file_s, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def killed(command: Command, folder: Path, reference: Path, expected: list[Moment]) -> Counter[str]:
@@ -198,20 +213,14 @@ def _stopped(command: Command, folder: Path, reference: Path, moment: Moment) ->
     process = start(command.words, folder)
     if not moment.comes(process, folder):
         return None
-    written, since = state_of(folder), time.monotonic()
-    os.killpg(process.pid, signal.SIGINT)
-    try:
-        process.wait(_WAS_ENDING_S)
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-    took_s = time.monotonic() - since
+    written = state_of(folder)
+    swallowed = goes_on_after_ctrl_c(process)
     if process.returncode == 0 and state_of(folder) == written:
         return None  # all had been written
     told = (folder / "log").read_text(errors="replace")
     lines = [line for line in told.splitlines() if line.strip()]
     one_line = "Traceback" not in told and bool(lines) and "stopped" in lines[-1].lower()
-    if process.returncode == 0 or took_s > _ENDS_S:
+    if process.returncode == 0 or swallowed:
         found["goes on"] = 1
     else:
         found["130 and one line" if process.returncode == 130 and one_line else "ends otherwise"] = 1
@@ -219,9 +228,22 @@ def _stopped(command: Command, folder: Path, reference: Path, moment: Moment) ->
     left = [path for path in files_in(folder / "out") if ".partial-" in str(path) or "-writing" in str(path)]
     found["leftovers"] = len(left)
     if found["ends otherwise"] or found["goes on"] or left:
-        print(f"{command.name}, Ctrl-C at {moment}, status {process.returncode} {took_s:.0f} s later: {left}")
+        print(f"{command.name}, Ctrl-C at {moment}, status {process.returncode}: {left}")
         print("    " + "\n    ".join(lines[-4:]), flush=True)
     return found
+
+
+def goes_on_after_ctrl_c(process: subprocess.Popen[bytes], ends_s: float = _ENDS_S) -> bool:
+    """Press Ctrl-C, and wait for the end; True where the process had to be killed."""
+    before_s, since = processor_s(process), time.monotonic()
+    os.killpg(process.pid, signal.SIGINT)
+    while process.poll() is None:
+        if processor_s(process) - before_s > ends_s or time.monotonic() - since > _HANGS_S:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            return True
+        time.sleep(_LOOK_EVERY_S)
+    return False
 
 
 def moments(count: int, first_file_s: float, seconds: float, rng: random.Random) -> Iterator[Moment]:
@@ -254,7 +276,9 @@ def main(
         if not (inputs / "session").is_dir():
             simulated(inputs / "session")
             undisturbed(commands(inputs)[0], Path(temporary) / "first")  # compiles what the others find
-        for command in commands(inputs):
+        every = commands(inputs)
+        last = max(number for number, command in enumerate(every) if only in command.name)
+        for command in every[: last + 1]:
             if only not in command.name and (inputs / command.name).is_dir():
                 continue
             shutil.rmtree(inputs / command.name, ignore_errors=True)
@@ -274,7 +298,7 @@ def main(
                     counts = killed(command, folder, inputs / command.name, expected)
                 else:
                     counts = pressed(command, folder, inputs / command.name, expected)
-                known = {"command": command.name, "undisturbed, s": f"{seconds:.1f}", "moments": count}
+                known = {"command": command.name, "undisturbed, processor s": f"{seconds:.1f}", "moments": count}
                 row = [str(known.get(column, counts[column])) for column in columns]
                 write_results(name, columns, [row], keys=1, seed=str(seed), folder=results)
 

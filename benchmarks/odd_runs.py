@@ -49,11 +49,12 @@ class Scene:
 
 @dataclass(frozen=True)
 class Case:
-    """A situation: what it changes in the scene and in the settings."""
+    """A situation: what it changes in the scene, in the settings, and in the trainer that is set up by them."""
 
     name: str
     data: Callable[[Scene], None] = lambda scene: None
     settings: Callable[[Any], None] = lambda config: None
+    trainer: Callable[[Any], None] = lambda trainer: None
 
 
 @dataclass(frozen=True)
@@ -135,6 +136,7 @@ def train(case: Case, scene: Scene, folder: Path, steps: int) -> Ended:
         case.settings(config)
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
+        case.trainer(trainer)
         before = _error(trainer)
         guarded = trainer._guard.record
 
@@ -256,6 +258,8 @@ CASES = (
     Case("204 bands", _bands(204)),
     Case("1000 bands", _bands(1000)),
     Case("mixed precision", settings=_set("mixed_precision", True)),
+    # nerfstudio has none on a processor, where PyTorch would take bfloat16.
+    Case("mixed precision, bfloat16", trainer=_set("mixed_precision", True)),
     Case("learning rates times 10", settings=_rates(10.0)),
     Case("learning rates times 100", settings=_rates(100.0)),
     Case("loss weights 0 and 1", settings=_weights(0.0, 1.0)),

@@ -52,8 +52,10 @@ def atomic_write(*paths: Path) -> Iterator[list[Path]]:
         for source, target in zip(temporary, paths, strict=True):
             os.replace(source, target)
     except OSError as error:
+        # Not the temporary name that an outer `atomic_write` has given.
+        target = paths[0].with_name(paths[0].name.removeprefix(f"{TEMPORARY_PREFIX}{os.getpid()}-"))
         raise InputError(
-            f"{paths[0]}: cannot be written ({error.strerror or error}); free some space or choose another folder."
+            f"{target}: cannot be written ({error.strerror or error}); free some space or choose another folder."
         ) from error
     finally:
         for source in temporary:

@@ -10,10 +10,13 @@ they are.
 
 from __future__ import annotations
 
+import errno
+import shutil
 import sys
+import time
 import types
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +40,13 @@ _REFUSED = {
     "ns-export pointcloud.",
 }
 """Commands that cannot work, by the name of their class, and what to do instead."""
+_EXPORTED = (
+    *("tsdf_mesh.ply", "poisson_mesh.ply", "mesh.obj", "material_0.mtl", "material_0.png"),
+    *("transforms_train.json", "transforms_eval.json"),
+)
+"""Files that nerfstudio's exports write, and do not write whole."""
+_FULL_BYTES = 1 << 12
+"""A disk with less free is full."""
 _PICTURES = ("gt-rgb", "rgb", "accumulation", "depth", "expected_depth")
 """Outputs that are pictures, which ``ns-render dataset`` writes if it is given no names."""
 
@@ -86,7 +96,7 @@ def _adapted(original: Callable[[Any], None]) -> Callable[[Any], None]:
                 original(self)
                 return
             try:
-                with interruption.one_line():
+                with interruption.one_line(), _nothing_half_exported(self):
                     _export_spectral_cloud(self) if type(self).__name__ == "ExportPointCloud" else original(self)
             except OSError as error:
                 if error.filename is None:
@@ -96,6 +106,41 @@ def _adapted(original: Callable[[Any], None]) -> Callable[[Any], None]:
 
     main.__doc__ = original.__doc__
     return main
+
+
+@contextmanager
+def _nothing_half_exported(command: Any) -> Iterator[None]:
+    """On a full disk, delete what an export had begun; libraries tell of it in their own ways, or not at all.
+
+    Raises:
+        InputError: the disk is full.
+    """
+    folder = getattr(command, "output_dir", None) or getattr(command, "output_path", None)
+    started = time.time()
+    failure: Exception | None = None
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        failure = error
+    if folder is None or not _is_full(folder, failure):
+        if failure is not None:
+            raise failure
+        return
+    for path in (folder / name for name in _EXPORTED):
+        if path.is_file() and path.stat().st_mtime >= started:
+            path.unlink()
+    raise InputError(f"{folder}: cannot be written to, because the disk is full; free some space.") from failure
+
+
+def _is_full(folder: Path, failure: Exception | None) -> bool:
+    """Whether the disk of a folder, which may not be there yet, is full, or that is what a command failed of."""
+    there = folder.absolute()
+    while not there.exists():
+        there = there.parent
+    told = isinstance(failure, OSError) and failure.errno in (errno.ENOSPC, errno.EDQUOT)
+    return told or shutil.disk_usage(there).free < _FULL_BYTES
 
 
 def _export_spectral_cloud(options: Any) -> None:

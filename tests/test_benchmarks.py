@@ -104,7 +104,8 @@ def test_the_same_seed_damages_alike_and_every_input_is_counted(tmp_path):
         if what == "other":
             raise KeyError(what)
 
-    outcome = run_kind(Kind("some", path, read), 4, seed=0, keep=tmp_path / "kept")
+    run_kind(Kind("some", path, read), 3, 0, tmp_path / "kept", tmp_path / "progress.json")  # and is interrupted
+    outcome = run_kind(Kind("some", path, read), 4, 0, tmp_path / "kept", tmp_path / "progress.json")
     assert outcome.row("some") == ["some", "4", "1", "1", "2", "0", "0"]
     assert len(list((tmp_path / "kept").iterdir())) == 2
     assert path.read_bytes() == b'{"a": 1}'

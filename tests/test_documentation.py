@@ -85,6 +85,15 @@ def test_every_hard_case_says_what_happens_and_names_a_test():
     assert cases > 60
 
 
+def test_every_test_that_a_page_names_is_there():
+    named = {
+        found for page in PAGES for found in re.findall(r"`([a-z_/]+)::(test_\w+)`", page.read_text(encoding="utf-8"))
+    }
+    assert len(named) > 100
+    for module, name in named:
+        assert f"def {name}(" in (ROOT / "tests" / f"{module}.py").read_text(encoding="utf-8"), (module, name)
+
+
 def test_every_function_of_a_training_step_names_a_test_of_each_kind():
     page = (ROOT / "docs" / "validation" / "hard_cases.md").read_text(encoding="utf-8")
     _, rows = page.split("### Every function of a training step")[1].split("| --- | --- | --- | --- | --- |\n")

@@ -12,7 +12,15 @@ from hsi_sc_nerf.cli.light import MaterialCommand
 from hsi_sc_nerf.cli.sessions import InspectCommand, ProcessCommand
 from hsi_sc_nerf.cli.trained_runs import RenderCommand, ReportCommand, SampleCommand
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import atomic_write, delete_remains, read_json, read_picture, require_writable, write_png
+from hsi_sc_nerf.files import (
+    atomic_write,
+    delete_remains,
+    read_json,
+    read_picture,
+    require_writable,
+    write_json,
+    write_png,
+)
 
 NOTHING = Path("nothing")
 
@@ -75,6 +83,17 @@ def test_json_of_a_windows_editor(tmp_path):
     path = tmp_path / "a.json"
     path.write_bytes('{\r\n"object": "Äpfel"\r\n}\r\n'.encode("utf-8-sig"))
     assert read_json(path, "mend it") == {"object": "Äpfel"}
+
+
+def test_a_full_disk_names_the_file_and_no_temporary_one(tmp_path, limit_of_files):
+    def write():
+        with atomic_write(tmp_path / "a.json", tmp_path / "b.json") as (first, second):
+            write_json(first, {"a": "b" * 1000})
+            write_json(second, {})
+
+    with limit_of_files(100), pytest.raises(InputError, match=rf"^{tmp_path}/a\.json: cannot be written"):
+        write()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_a_killed_process_left_is_deleted_and_what_a_running_one_writes_is_kept(tmp_path):

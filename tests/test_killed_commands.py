@@ -4,6 +4,7 @@ import os
 import random
 import shutil
 import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-from killed_commands import Command, moments, start
+from killed_commands import Command, Moment, goes_on_after_ctrl_c, moments, start
 from left_files import differences, half_written, leftovers
 
 from hsi_sc_nerf.files import atomic_write, write_json
@@ -59,3 +60,40 @@ def test_moments_are_spread_and_repeat():
     assert [int(moment.after_s / (2.0 if moment.writing else 2.4)) for moment in found] == [*range(5), *range(5)]
     assert [moment.writing for moment in found] == [False] * 5 + [True] * 5
     assert found == list(moments(10, 2.0, 12.0, random.Random(1)))
+
+
+IGNORES = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
+READY = "open('ready', 'w')\n"
+
+
+def python(script, folder):
+    """A process as the benchmark starts them."""
+    return subprocess.Popen(
+        [sys.executable, "-c", script], cwd=folder, start_new_session=True, stderr=subprocess.DEVNULL
+    )
+
+
+@pytest.mark.parametrize(
+    ("script", "swallows"),
+    [
+        (IGNORES + READY + "while True: pass", True),
+        (READY + "while True: pass", False),
+        (IGNORES + READY + "import time; time.sleep(0.3)", False),  # ends by itself, however long it takes
+    ],
+    ids=["goes on", "ends", "was ending"],
+)
+def test_what_goes_on_after_ctrl_c_is_told_by_its_processor_time(script, swallows, tmp_path):
+    process = python(script, tmp_path)
+    while not (tmp_path / "ready").exists():
+        assert process.poll() is None
+    assert goes_on_after_ctrl_c(process, ends_s=0.1) == swallows
+    assert process.returncode is not None
+
+
+@pytest.mark.parametrize("writing", [True, False])
+def test_a_moment_after_the_end_does_not_come(writing, tmp_path):
+    assert not Moment(60.0, writing).comes(python("", tmp_path), tmp_path)
+    process = python("while True: pass", tmp_path)
+    assert Moment(0.01, writing=False).comes(process, tmp_path)
+    process.kill()
+    process.wait()

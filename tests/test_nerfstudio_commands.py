@@ -3,6 +3,8 @@
 import copy
 import errno
 import inspect
+import os
+import shutil
 import signal
 import sys
 import types
@@ -97,6 +99,20 @@ def _with_other_names(config_path):
     (config_path.parent / "nerfstudio_models" / "step-best.ckpt").write_bytes(b"")
 
 
+class _Executes:
+    """What an unsafe loader of pickles would execute: a folder is made."""
+
+    def __init__(self, folder):
+        self.folder = folder
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.folder),)
+
+
+def _that_executes(config_path):
+    with_checkpoint(config_path, pipeline=_Executes(config_path.parent / "executed"))
+
+
 NO_RUNS = {
     "no file": (lambda path: path.unlink(), "there is no such file"),
     "empty": (_empty, "cannot be read"),
@@ -115,6 +131,7 @@ NO_RUNS = {
         lambda path: with_checkpoint(path, pipeline={"a": 1}),
         "is no checkpoint of a model",
     ),
+    "checkpoint that executes": (_that_executes, "is not a readable checkpoint"),
     "stray file": (_with_stray_file, "notes.txt: is no checkpoint, and nerfstudio takes it for one; move it"),
 }
 
@@ -171,6 +188,44 @@ def test_scores_are_written_whole_or_not_at_all(ours, tmp_path, monkeypatch):
         made.output_path.write_text("better", "utf8")
     assert (tmp_path / "scores.json").read_text() == "good"
     assert list(tmp_path.glob(".*")) == []
+
+
+@pytest.mark.parametrize(
+    ("failure", "free_bytes", "refused"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), 10**9, True),
+        (RuntimeError("Unexpected EOF"), 1000, True),  # a library that reads what another has not written
+        (None, 1000, True),  # a library that does not tell
+        (RuntimeError("Unexpected EOF"), 10**9, False),
+        (None, 10**9, False),
+    ],
+)
+def test_an_export_on_a_full_disk_is_one_sentence_and_leaves_nothing(
+    ours, tmp_path, monkeypatch, failure, free_bytes, refused
+):
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in ("tsdf_mesh.ply", "notes.txt"):
+        (out / name).write_text("earlier")
+        os.utime(out / name, (0, 0))
+
+    def export(self):
+        (out / "poisson_mesh.ply").write_text("half")
+        if failure is not None:
+            raise failure
+
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: types.SimpleNamespace(free=free_bytes))
+    made = command("ExportTSDFMesh", with_checkpoint(ours), output_dir=out)
+    if refused:
+        with pytest.raises(SystemExit, match=r"^hsi-sc-nerf: [^\n]*out: [^\n]*the disk is full; free some space\.$"):
+            adapter._adapted(export)(made)
+    elif failure is not None:
+        with pytest.raises(RuntimeError, match="Unexpected EOF"):
+            adapter._adapted(export)(made)
+    else:
+        adapter._adapted(export)(made)
+    left = {"tsdf_mesh.ply", "notes.txt"} | (set() if refused else {"poisson_mesh.ply"})
+    assert {path.name for path in out.iterdir()} == left
 
 
 def test_poisson_estimates_normals_where_the_model_has_none(ours):

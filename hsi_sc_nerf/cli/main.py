@@ -56,7 +56,7 @@ def main() -> None:
         goes_on = "; the same command goes on where it stopped" if type(command).__name__ in _GO_ON else ""
         with interruption.one_line(lambda: f"Stopped{goes_on}."):
             command.main()
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         _tell_error(error)
         raise
     finally:
@@ -115,6 +115,8 @@ def _tell_error(error: BaseException) -> None:
 
     from hsi_sc_nerf.errors import InputError
 
+    if isinstance(error, SystemExit) and isinstance(error.code, str):  # as in nerfstudio's commands, which open runs
+        error = InputError(error.code.removeprefix("hsi-sc-nerf: "))
     if isinstance(error, OSError) and error.filename is not None:
         error = InputError(f"{error.filename}: {error.strerror}; choose another path.")
     if isinstance(error, InputError):

@@ -7,6 +7,7 @@ tables of `table`, which xarray opens. They are written without xarray, which ne
 from __future__ import annotations
 
 import importlib
+import math
 import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
@@ -36,6 +37,8 @@ LAS_STEP_M = 1e-6
 """LAS stores positions as whole steps."""
 LAS_MAX_DIMENSIONS = 341
 """A dimension of extra bytes is described by 192 bytes, and all descriptions share one record of at most 65535."""
+_NETCDF_BYTES = 1 << 18
+"""More than names, attributes and wavelengths take in a NetCDF file."""
 _LAS_POINT_FORMAT = 7
 """With colours."""
 _LAS_TEXT_RECORD = 3
@@ -150,14 +153,26 @@ def _fill(variables: Mapping[str, Any], cloud: CloudStream) -> None:
 def _write_netcdf(path: Path, cloud: CloudStream) -> None:
     import h5netcdf
 
-    with atomic_write(path) as (temporary,), h5netcdf.File(temporary, "w") as file:
-        file.attrs.update(table_attributes(cloud.run))
-        file.dimensions = {"point": cloud.count, "wavelength": len(cloud.wavelengths_nm)}
-        wavelength = file.create_variable("wavelength", ("wavelength",), "<f8", data=cloud.wavelengths_nm)
-        wavelength.attrs.update(WAVELENGTH_ATTRIBUTES)
-        for name, dtype, dimensions, attributes in _variables(cloud):
-            file.create_variable(name, dimensions, dtype).attrs.update(attributes)
-        _fill(file.variables, cloud)
+    sizes = {"point": cloud.count, "wavelength": len(cloud.wavelengths_nm)}
+    variables = list(_variables(cloud))
+    values = sum(np.dtype(dtype).itemsize * math.prod(sizes[d] for d in dims) for _, dtype, dims, _ in variables)
+    with atomic_write(path) as (temporary,):
+        _require_space(temporary, values + _NETCDF_BYTES)
+        with h5netcdf.File(temporary, "w") as file:
+            file.attrs.update(table_attributes(cloud.run))
+            file.dimensions = sizes
+            wavelength = file.create_variable("wavelength", ("wavelength",), "<f8", data=cloud.wavelengths_nm)
+            wavelength.attrs.update(WAVELENGTH_ATTRIBUTES)
+            for name, dtype, dimensions, attributes in variables:
+                file.create_variable(name, dimensions, dtype).attrs.update(attributes)
+            _fill(file.variables, cloud)
+
+
+def _require_space(path: Path, size_bytes: int) -> None:
+    """Fail while a file is still empty if the disk has no room for it: HDF5 on a full disk ends the process."""
+    if hasattr(os, "posix_fallocate"):
+        with path.open("wb") as file:
+            os.posix_fallocate(file.fileno(), 0, size_bytes)
 
 
 def _write_zarr(path: Path, cloud: CloudStream) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -45,6 +46,7 @@ from hsi_sc_nerf.models.training_watch import (
     RisenLossGuard,
     TrainingDivergedError,
     end_diverged_run,
+    files_of_run,
     flush_logs,
     non_finite_names,
     stage_summary,
@@ -143,7 +145,7 @@ class StagedTrainer(Trainer):
         self._captured: CapturedSteps | None = None
         self.stop_training = False  # nerfstudio sets it when the training begins; single steps read it too
         try:
-            with one_sentence(), interruption.one_line(self._stopped):
+            with one_sentence(), interruption.one_line(self._stopped), files_of_run(self.base_dir):
                 self._loaded = resume_effects(self.config)
                 super().setup(test_mode)
         except SystemExit:
@@ -178,15 +180,17 @@ class StagedTrainer(Trainer):
     def train(self) -> None:
         """Train the remaining steps of the plan; nerfstudio would add ``max_num_iterations`` to a resumed run."""
         try:
-            with one_sentence(), interruption.one_line(self._stopped):
+            with one_sentence(), interruption.one_line(self._stopped), files_of_run(self.base_dir):
                 self._train()
+                flush_logs()
             interruption.ignore_when_done()
         except TrainingDivergedError as error:
             # Skipped steps do not change the weights: unless the loss had risen before, they are still good.
             self.save_checkpoint(self.step)
             end_diverged_run(error, self.checkpoint_dir)
         finally:
-            flush_logs()
+            with suppress(OSError):  # what went wrong before is told
+                flush_logs()
 
     def _train(self) -> None:
         if self._loaded is not None and self._keep_stage_of(self._loaded) and self.schedule.complete:
@@ -234,7 +238,7 @@ class StagedTrainer(Trainer):
         self.schedule.end_step(step)
         self._trained_step = step
         self.stop_training |= self.schedule.complete
-        self._risen_loss.record(step, self.schedule, float(loss))
+        self._risen_loss.record(step, self.schedule, float(loss.detach()))
         return loss, loss_dict, metrics_dict
 
     def _captured_iteration(self, steps: CapturedSteps, step: int) -> TRAIN_INTERATION_OUTPUT:

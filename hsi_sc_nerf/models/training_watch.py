@@ -7,6 +7,7 @@ above what it was and stays there.
 from __future__ import annotations
 
 import math
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -20,6 +21,7 @@ from nerfstudio.utils.profiler import PROFILER
 from rich.progress import TextColumn
 from torch import Tensor
 
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.models.schedule import Schedule
 from hsi_sc_nerf.models.stages import Stage
 from hsi_sc_nerf.terminal import timed_progress
@@ -161,6 +163,30 @@ def flush_logs() -> None:
     for event_writer in writer.EVENT_WRITERS:
         if isinstance(event_writer, writer.TensorboardWriter):
             event_writer.tb_writer.flush()
+
+
+@contextmanager
+def files_of_run(folder: Path) -> Iterator[None]:
+    """In the block, a file that the system refuses, such as the logs on a full disk, is one sentence.
+
+    Raises:
+        InputError: there was one.
+    """
+    hook = threading.excepthook
+
+    def tell(raised: threading.ExceptHookArgs) -> None:
+        if not isinstance(raised.exc_value, OSError):  # the thread that writes the logs raises in this one as well
+            hook(raised)
+
+    threading.excepthook = tell
+    try:
+        yield
+        threading.excepthook = hook
+    except OSError as error:  # that thread may be about to tell of it
+        raise InputError(
+            f"{error.filename or folder}: cannot be read or written ({error.strerror or error}); mend that, or free "
+            "some space, and resume with --load-dir."
+        ) from error
 
 
 def stopped_run(checkpoints: Path) -> str:

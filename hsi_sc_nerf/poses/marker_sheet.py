@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Literal
 
@@ -80,9 +81,12 @@ def write_marker_sheets(path: Path, sheets: Sequence[Figure]) -> None:
     """
     if path.suffix.lower() != ".pdf":
         raise InputError(f"{path}: sheets to print are PDF files; give a name that ends with .pdf.")
-    with rc_context({"pdf.fonttype": 42}), atomic_write(path) as (temporary,), PdfPages(temporary) as pages:
+    memory = BytesIO()  # on a full disk Matplotlib fails in a way of its own
+    with rc_context({"pdf.fonttype": 42}), PdfPages(memory) as pages:
         for sheet in sheets:
             pages.savefig(sheet)
+    with atomic_write(path) as (temporary,):
+        temporary.write_bytes(memory.getvalue())
 
 
 def _empty_sheet(width_mm: float, height_mm: float) -> tuple[Figure, Axes]:

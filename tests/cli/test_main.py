@@ -44,6 +44,20 @@ def test_a_file_that_the_system_refuses_is_one_line(monkeypatch, capsys):
     assert told.count("\n") == 1
 
 
+def test_a_sentence_of_what_opens_runs_is_told_as_any_other(monkeypatch, capsys):
+    """Data and model are nerfstudio's parts, which end its commands as well."""
+
+    def refused(self):
+        raise SystemExit("hsi-sc-nerf: cubes/a.hdr: is missing; process again.")
+
+    monkeypatch.setattr(MarkersCommand, "main", refused)
+    monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", "markers"])
+    with pytest.raises(SystemExit) as ended:
+        entry.main()
+    assert ended.value.code == 2
+    assert capsys.readouterr().err == "Error: cubes/a.hdr: is missing; process again.\n"
+
+
 def test_an_error_that_is_no_file_is_not_hidden(monkeypatch):
     def broken(self):
         raise OSError("no file is named")

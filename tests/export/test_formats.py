@@ -97,6 +97,19 @@ def test_what_breaks_off_leaves_what_was_there(tmp_path: Path, file_format) -> N
     assert sum(file.stat().st_size for file in tmp_path.rglob("*")) == size
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("room_bytes", [0, 5000])
+@pytest.mark.parametrize("file_format", ["ply", "las", "netcdf", "zarr"])
+def test_a_full_disk_is_one_sentence_and_leaves_what_was_there(tmp_path, file_format, room_bytes, limit_of_files):
+    before = write_cloud(tmp_path / "cloud", stream(random_cloud(COUNT)), file_format)
+    size = sum(file.stat().st_size for file in tmp_path.rglob("*"))
+    told = r"cannot be written \(.*\); free some space"
+    with limit_of_files(room_bytes), pytest.raises(InputError, match=told):
+        write_cloud(tmp_path / "cloud", stream(random_cloud(9000)), file_format)
+    assert list(tmp_path.iterdir()) == [before]
+    assert sum(file.stat().st_size for file in tmp_path.rglob("*")) == size
+
+
 def test_zarr_replaces_nothing_that_is_not_its_own(tmp_path: Path) -> None:
     pytest.importorskip("zarr")
     (tmp_path / "cloud.zarr").mkdir()

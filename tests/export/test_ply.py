@@ -88,19 +88,6 @@ def test_bands_closer_than_two_decimals_get_more(tmp_path: Path) -> None:
         band_property_names(np.array([500.0, 500.0]))
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
-def test_a_full_disk_leaves_the_earlier_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "cloud.ply"
-    path.write_bytes(b"earlier file")
-    opened = Path.open
-    monkeypatch.setattr(Path, "open", lambda self, mode="r": opened(Path("/dev/full"), mode))
-    with pytest.raises(InputError, match=r"cloud\.ply.*cannot be written.*No space left"):
-        write_spectral_ply(path, random_cloud(5000))
-    monkeypatch.undo()
-    assert path.read_bytes() == b"earlier file"
-    assert [file.name for file in tmp_path.iterdir()] == ["cloud.ply"]
-
-
 @pytest.mark.parametrize(
     "change",
     [

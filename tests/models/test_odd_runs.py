@@ -16,6 +16,7 @@ ENDS = [
     "two training views, 180 degrees apart",
     "loss weights 0 and 1",
     "learning rates times 100",
+    "mixed precision, bfloat16",
 ]
 
 

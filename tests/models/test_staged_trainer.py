@@ -1,16 +1,18 @@
 """Stages, checkpoints and skipped steps of real, tiny training runs."""
 
 import copy
+import shutil
 from unittest.mock import Mock
 
 import pytest
 import torch
 from clock_by_hand import time_by_hand
-from nerfstudio.utils import profiler
+from nerfstudio.utils import profiler, writer
 from scipy.ndimage import distance_transform_edt
 from small_trainer import STEPS, trainer
 
 from hsi_sc_nerf.config import hsi_sc_nerf
+from hsi_sc_nerf.models import staged_trainer
 from hsi_sc_nerf.models.checkpoints import allow_nerfstudio_checkpoints
 from hsi_sc_nerf.models.stages import StageConfig, full_frame_stage, masked_stage
 from hsi_sc_nerf.packed.pixels import BOUNDARY_PX
@@ -199,6 +201,43 @@ def test_a_full_disk_leaves_the_earlier_checkpoint(tiny_dataset, tmp_path, monke
         made.save_checkpoint(1)
     assert list(made.checkpoint_dir.iterdir()) == before
     assert [path for path in made.base_dir.iterdir() if path.name.startswith(".")] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("room_bytes", [0, 10_000])
+def test_a_disk_that_fills_up_in_training_is_one_sentence(
+    tiny_dataset, tmp_path, monkeypatch, limit_of_files, room_bytes
+):
+    """No file fits, or the beginning of the logs does."""
+    monkeypatch.setattr(writer, "EVENT_WRITERS", [])  # what has failed once fails in the runs after it
+    made = trainer(tiny_dataset, tmp_path)
+    told = r"^hsi-sc-nerf: [^\n]*free some space[^\n]*\.$"
+    with limit_of_files(room_bytes), pytest.raises(SystemExit, match=told):
+        made.train()
+    assert list(made.base_dir.rglob("*.ckpt")) == []
+
+
+@pytest.mark.slow
+def test_logs_that_cannot_be_written_end_a_run_in_one_sentence(tiny_dataset, tmp_path, monkeypatch):
+    made = trainer(tiny_dataset, tmp_path)
+
+    def full_disk():
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(staged_trainer, "flush_logs", full_disk)
+    with pytest.raises(SystemExit, match=rf"^hsi-sc-nerf: {made.base_dir}: [^\n]*No space left[^\n]*--load-dir\.$"):
+        made.train()
+    assert list(made.checkpoint_dir.iterdir())
+
+
+@pytest.mark.slow
+def test_cubes_that_vanish_in_training_are_named_when_they_are_needed(tiny_dataset, tmp_path):
+    """Those of training views are open; held-out views are read at the end of a stage."""
+    data = shutil.copytree(tiny_dataset[0], tmp_path / "data")
+    made = trainer((data, None), tmp_path, evaluate_stages=True)
+    shutil.rmtree(data / "cubes")
+    with pytest.raises(SystemExit, match=r"^hsi-sc-nerf: [^\n]*cubes/[^\n]*\.$"):
+        made.train()
 
 
 @pytest.mark.slow

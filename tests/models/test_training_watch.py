@@ -1,11 +1,15 @@
 """Steps that are not finite; what TensorBoard is given, read back with its own reader."""
 
+import errno
+import threading
+
 import numpy as np
 import pytest
 import torch
 from small_trainer import STEPS, trainer
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.models.schedule import Schedule
 from hsi_sc_nerf.models.stages import Stage, StagePlan, full_frame_stage, masked_stage
 from hsi_sc_nerf.models.training_watch import (
@@ -15,6 +19,7 @@ from hsi_sc_nerf.models.training_watch import (
     NonFiniteGuard,
     RisenLossGuard,
     TrainingDivergedError,
+    files_of_run,
     non_finite_names,
     stage_summary,
 )
@@ -125,3 +130,30 @@ def test_summary_names_both_readings():
         "masked stage, held-out views: object SAM 0.0292 rad, RMSE 0.0305, SSIM 0.888, PSNR 29.1 dB; "
         "whole frame SAM 0.0584 rad, RMSE 0.0610, SSIM 1.776, PSNR 58.3 dB"
     )
+
+
+def test_a_file_that_the_system_refuses_is_told_once(tmp_path, monkeypatch):
+    """The thread that writes TensorBoard's logs fails of a full disk, and the main thread with the same error."""
+    seen = []
+    monkeypatch.setattr(threading, "excepthook", lambda raised: seen.append(raised.exc_value))
+
+    def fail_in_thread(error):
+        def fail():
+            raise error
+
+        thread = threading.Thread(target=fail)
+        thread.start()
+        thread.join()
+
+    def run_on_a_full_disk():
+        full = OSError(errno.ENOSPC, "No space left on device")
+        with files_of_run(tmp_path):
+            fail_in_thread(full)
+            raise full
+
+    with pytest.raises(InputError, match=rf"^{tmp_path}: cannot be .*No space left.*--load-dir\.$"):
+        run_on_a_full_disk()
+    assert seen == []
+    with files_of_run(tmp_path):
+        fail_in_thread(fault := ValueError("something else"))
+    assert seen == [fault]

@@ -7,7 +7,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from hsi_sc_nerf.cli.main import main
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.marker_detection import detect_markers
-from hsi_sc_nerf.poses.marker_sheet import PAPER_MM, RULER_MM, marker_sheets
+from hsi_sc_nerf.poses.marker_sheet import PAPER_MM, RULER_MM, marker_sheets, write_marker_sheets
 
 DPI = 150
 
@@ -60,6 +60,14 @@ def test_the_command_writes_pages_of_the_papers_size(tmp_path, monkeypatch, caps
 def test_what_cannot_be_printed_is_refused_in_a_sentence(options, message) -> None:
     with pytest.raises(InputError, match=message):
         marker_sheets(**{"marker_side_m": 0.02, "dictionary": "DICT_5X5_50", "ids": range(4)} | options)
+
+
+def test_a_full_disk_is_one_sentence(tmp_path, limit_of_files) -> None:
+    sheets = marker_sheets(0.02, "DICT_5X5_50", range(4))
+    told = r"markers\.pdf: cannot be written .*free some space"
+    with limit_of_files(100), pytest.raises(InputError, match=told):
+        write_marker_sheets(tmp_path / "markers.pdf", sheets)
+    assert not list(tmp_path.iterdir())
 
 
 def test_another_file_format_is_refused(tmp_path, monkeypatch, capsys) -> None:
