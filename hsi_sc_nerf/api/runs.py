@@ -209,5 +209,7 @@ def open_run(folder: Path | str) -> Run:
     folder = Path(folder)
     found = [folder / name for name in _CONFIGS if (folder / name).is_file()] if folder.is_dir() else [folder]
     if not found:
-        raise InputError(f"{folder}: holds no config.yml; give the folder of a trained run.")
+        below = sorted(folder.rglob("config.yml"))
+        give = below[-1].parent if below else "the folder of a trained run"
+        raise InputError(f"{folder}: holds no config.yml; give {give}.")
     return Run(trained_run.open_run(found[0]), run_name(found[0]))
