@@ -51,6 +51,10 @@ class View:
     rendered: RenderedView
     dataset: PackedDataset
 
+    def __repr__(self) -> str:
+        lines, samples, bands = self.rendered.spectral.shape
+        return f"<View {self.name}: {lines} lines, {samples} samples, {bands} bands>"
+
     @property
     def reflectance(self) -> Float[np.ndarray, "lines samples bands"]:
         """The cube; before the background, transparent pixels include its reflectance."""
@@ -94,6 +98,9 @@ class Run:
 
     trained: trained_run.TrainedRun
     name: str
+
+    def __repr__(self) -> str:
+        return f"<Run {self.name} on {self.dataset}>"
 
     @property
     def dataset(self) -> PackedDataset:
