@@ -13,6 +13,7 @@ import inspect
 import io
 import json
 import os
+import posixpath
 import re
 import textwrap
 from collections.abc import Iterator
@@ -30,12 +31,37 @@ from hsi_sc_nerf.cli.main import COMMANDS, command_line, named_commands
 from hsi_sc_nerf.indices.catalogue import CATALOGUE
 from hsi_sc_nerf.terminal import markdown_table
 
+MADE_FROM = {
+    "hsi_sc_nerf/cli/commands.py": "reference/commands.md",
+    "hsi_sc_nerf/config.py": "reference/settings.md",
+    "hsi_sc_nerf/indices/catalogue.py": "reference/indices.md",
+}
+"""Pages of the site that no file of the repository holds, by the source that they are made from."""
 TABLE = re.compile(r'\{\{ results\("([a-z_]+)"\) \}\}')
 
 
 def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
-    """Put the results' tables into a page."""
-    return TABLE.sub(lambda match: results_table(match.group(1)), markdown)
+    """Put the results' tables into a page, and let its links lead to the pages that are made from the code."""
+    return site_links(TABLE.sub(lambda match: results_table(match.group(1)), markdown), page.file.src_uri)
+
+
+def site_links(markdown: str, uri: str) -> str:
+    """Links of a page to sources and notebooks, which work where only the repository is, as links of the site.
+
+    Example:
+        >>> site_links("[catalogue](../../hsi_sc_nerf/indices/catalogue.py)", "how-to/viewer.md")
+        '[catalogue](../reference/indices.md)'
+    """
+    folder = posixpath.dirname(uri)
+
+    def of_site(match: re.Match[str]) -> str:
+        target = posixpath.normpath(posixpath.join("docs", folder, match.group(1)))
+        made = MADE_FROM.get(target) or re.sub(r"^docs/(notebooks/.*)\.ipynb$", r"\1.md", target)
+        if made in (target, uri):
+            return match.group()
+        return f"]({posixpath.relpath(made, folder or '.')})"
+
+    return re.sub(r"\]\(([^)#:]+)\)", of_site, markdown)
 
 
 def on_files(files: Files, config: MkDocsConfig, **_: Any) -> Files:

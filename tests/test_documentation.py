@@ -14,6 +14,8 @@ documentation = pytest.importorskip("documentation", reason="the documentation's
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 COMMANDS = documentation.command_names()
+LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)")
+"""Relative ones."""
 
 
 def test_every_committed_table_is_shown_on_a_page():
@@ -34,6 +36,25 @@ def test_the_readme_shows_the_committed_results():
     between = readme.split("<!-- results -->\n")[1].split("\n<!-- end of results -->")[0]
     assert between == documentation.readme_table()
     assert len(readme.splitlines()) <= 120
+
+
+def test_links_of_pages_lead_to_files_of_the_repository_and_to_pages_of_the_site():
+    """On a forge there is the repository alone; the site has the pages that are made from the code."""
+    made = set(documentation.MADE_FROM.values()) | {
+        f"notebooks/{path.stem}.md" for path in (ROOT / "docs" / "notebooks").glob("*.ipynb")
+    }
+    lead_to_made = set()
+    for page in PAGES:
+        text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+        for target in LINK.findall(text):
+            assert (page.parent / target).exists(), f"{page.name}: {target}"
+        if page.parent != ROOT:
+            uri = page.relative_to(ROOT / "docs")
+            for target in LINK.findall(documentation.site_links(text, uri.as_posix())):
+                found = (page.parent / target).resolve().relative_to(ROOT).as_posix().removeprefix("docs/")
+                assert found in made or (ROOT / "docs" / found).exists(), f"{page.name}: {target}"
+                lead_to_made |= made & {found}
+    assert lead_to_made == made
 
 
 def test_every_option_in_a_page_exists():

@@ -56,6 +56,10 @@ class Measurement:
     components: Components | None
     settings: Mapping[str, Any]
 
+    def __repr__(self) -> str:
+        size, names = self.size, ", ".join(region.name for region in self.traits.regions)
+        return f"<Measurement: {1e3 * size.volume_l:.4g} mL, {1e4 * size.area_m2:.4g} cm²; {names}>"
+
     def content(self) -> dict[str, Any]:
         """All but spectra, as ``traits.json`` holds it: metres, square metres, litres."""
         watertight = open_edges(self.surface.mesh) == 0

@@ -29,6 +29,11 @@ class Cloud(SpectralCloud):
     ``spectra`` are as measured. `index` and `calibration` take the material's where the cloud has them.
     """
 
+    def __repr__(self) -> str:
+        nm = self.wavelengths_nm
+        columns = ", ".join(("points", "normals", "colours", "spectra", *self.extra))
+        return f"<Cloud of {len(self):,} points, {len(nm)} bands from {nm[0]:g} to {nm[-1]:g} nm; {columns}>"
+
     @classmethod
     def of(cls, cloud: SpectralCloud) -> Cloud:
         """The same points."""

@@ -51,6 +51,10 @@ class View:
     rendered: RenderedView
     dataset: PackedDataset
 
+    def __repr__(self) -> str:
+        lines, samples, bands = self.rendered.spectral.shape
+        return f"<View {self.name}: {lines} lines, {samples} samples, {bands} bands>"
+
     @property
     def reflectance(self) -> Float[np.ndarray, "lines samples bands"]:
         """The cube; before the background, transparent pixels include its reflectance."""
@@ -94,6 +98,9 @@ class Run:
 
     trained: trained_run.TrainedRun
     name: str
+
+    def __repr__(self) -> str:
+        return f"<Run {self.name} on {self.dataset}>"
 
     @property
     def dataset(self) -> PackedDataset:
@@ -209,5 +216,7 @@ def open_run(folder: Path | str) -> Run:
     folder = Path(folder)
     found = [folder / name for name in _CONFIGS if (folder / name).is_file()] if folder.is_dir() else [folder]
     if not found:
-        raise InputError(f"{folder}: holds no config.yml; give the folder of a trained run.")
+        below = sorted(folder.rglob("config.yml"))
+        give = below[-1].parent if below else "the folder of a trained run"
+        raise InputError(f"{folder}: holds no config.yml; give {give}.")
     return Run(trained_run.open_run(found[0]), run_name(found[0]))

@@ -142,6 +142,12 @@ class PackedDataset:
     fingerprint: str | None = None
     effects: tuple[Effect, ...] = ()
 
+    def __repr__(self) -> str:
+        camera, nm = self.intrinsics, self.wavelengths_nm
+        bands = f"{len(nm)} bands from {nm[0]:g} to {nm[-1]:g} nm"
+        of = f"{len(self.frames)} frames of {camera.w} x {camera.h} pixels, {bands}"
+        return f"<PackedDataset {self.root}: {self.object_name}, {of}>"
+
     def cube_of(self, frame: PackedFrame) -> UInt16[np.memmap, "lines samples bands"]:
         """`PackedFrame.cube`, of the size that ``transforms.json`` states.
 

@@ -22,6 +22,12 @@ def test_a_saved_cloud_is_read_again(tmp_path, name):
     assert isinstance(read_cloud(tmp_path / name).select(slice(3)), Cloud)
 
 
+def test_what_a_notebook_shows_of_a_cloud_is_one_line():
+    columns = "points, normals, colours, spectra, opacity, views"
+    shown = f"<Cloud of 1,500 points, 4 bands from 397.32 to 1003.58 nm; {columns}>"
+    assert repr(Cloud.of(random_cloud(1500))) == shown
+
+
 def test_indices_and_calibrations_are_of_the_material_where_it_is_known(tmp_path):
     table = tmp_path / "sugar.csv"
     table.write_text("# intercept: 2\nwavelength_nm,coefficient\n397.32,1\n525.1,10\n650,100\n")

@@ -99,3 +99,20 @@ def test_a_folder_without_a_run_is_one_sentence(tmp_path):
     for path in (tmp_path, tmp_path / "none"):
         with pytest.raises(InputError, match=path.name):
             hsn.open_run(path)
+
+
+@pytest.mark.slow
+def test_what_a_notebook_shows_of_run_dataset_and_view_is_one_line(run):
+    view = run.render(angle_deg=10.0)
+    shown = {one: repr(one) for one in (run, run.dataset, view)}
+    assert all("\n" not in text and len(text) < 400 for text in shown.values()), shown
+    assert f"{len(run.dataset.frames)} frames of {run.dataset.intrinsics.w} x" in shown[run]
+    assert f"{run.dataset.intrinsics.h} lines" in shown[view]
+
+
+@pytest.mark.slow
+def test_a_folder_above_a_run_is_refused_with_the_run_to_give(run):
+    folder = run.dataset.root.parent / "runs"
+    (config,) = folder.rglob("config.yml")
+    with pytest.raises(InputError, match=f"give {config.parent}"):
+        hsn.open_run(folder)
