@@ -39,7 +39,7 @@ class CollectCommand:
         with progress_bar("reading", "objects", count) as done:
             table = read_table(out, done)
         parquet = write_tables(table, out)
-        with progress_bar("pictures", "objects", count) as done:
+        with progress_bar("pictures", "objects", len(table.rows)) as done:
             page = write_overview(table, out, done)
         console = Console(highlight=False, soft_wrap=True)
         if not parquet:
@@ -47,4 +47,4 @@ class CollectCommand:
                 "[yellow]traits.parquet is not written, because pyarrow is not installed; run `pip install "
                 "'hsi-sc-nerf\\[batch]'` to have it."
             )
-        console.print(f"{count} objects. Open {escape(str(page))} in a browser; {CSV_NAME} holds the same.")
+        console.print(f"{len(table.rows)} objects. Open {escape(str(page))} in a browser; {CSV_NAME} holds the same.")

@@ -14,6 +14,7 @@ import tyro
 from rich.console import Console
 from rich.markup import escape
 
+from hsi_sc_nerf.analysis.report import each_object
 from hsi_sc_nerf.batch.session_steps import (
     MATERIAL_NAME,
     STEPS_NAME,
@@ -98,9 +99,11 @@ def _show_results(out: Path, console: Console) -> None:
     scores = "SAM {sam:.4f} rad, RMSE {rmse:.4f}, SSIM {ssim:.3f}, PSNR {psnr:.1f} dB".format(**results)
     console.print(f"Held-out views, inside the mask: {scores}")
     traits = json.loads((out / "traits" / "traits.json").read_text(encoding="utf-8"))
-    size = traits["size"]
-    volume = f"volume {1000 * size['volume_l']:.1f} mL" if traits["watertight"] else "no closed volume"
-    console.print(f"Size: height {1000 * size['height_m']:.1f} mm, area {1e4 * size['area_m2']:.1f} cm², {volume}")
+    for one in each_object(traits):
+        size, which = one["size"], f" of piece {one['piece']}" if "piece" in one else ""
+        volume = f"volume {1000 * size['volume_l']:.1f} mL" if one["watertight"] else "no closed volume"
+        height_mm, area_cm2 = 1000 * size["height_m"], 1e4 * size["area_m2"]
+        console.print(f"Size{which}: height {height_mm:.1f} mm, area {area_cm2:.1f} cm², {volume}")
     if (out / MATERIAL_NAME).is_file():
         console.print(f"Light: {sentences(json.loads((out / MATERIAL_NAME).read_text(encoding='utf-8')))[0]}")
     for line in _warnings(out):
