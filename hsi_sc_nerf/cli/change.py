@@ -50,7 +50,7 @@ class ChangeCommand:
     repeat: Path | None = None
     """Another capture of the first day, for which the object was set down anew: a cloud, folder or run as for the
     days. It tells what setting down, poses and lamps alone make of the object; what is no larger is no change."""
-    band_nm: tuple[float, ...] = ()
+    band_nm: tuple[float, ...] = between(1.0, 1e5, default=())
     """Wavelengths (nm) whose reflectance is compared, beside spectra and indices."""
     index: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """An index to compare, by its name or as a formula, as for `hsi-sc-nerf traits`. May be repeated. Default: NDVI,
@@ -58,16 +58,16 @@ class ChangeCommand:
     session_std: float = between(0.0, 1.0, default=0.01)
     """Relative standard deviation of what the white references of two sessions make of one reflectance. It counts in
     what is said of the whole surface, not in what changed here and not there."""
-    piece: tuple[int, ...] = ()
+    piece: tuple[int, ...] = between(1, math.inf, default=())
     """Where several objects stand on the table, which of them: one number for all clouds, or one for each, a repeat
     last. 1 is the largest, as for `hsi-sc-nerf traits`, which tells where each stands."""
-    max_incidence_deg: float = MAX_INCIDENCE_DEG
+    max_incidence_deg: float = between(1.0, 90.0, default=MAX_INCIDENCE_DEG)
     """Spectra come only from points that a camera sees at an incidence angle of at most this many degrees."""
     library: Path | None = None
     """Reference spectra to classify the surface by, as for `hsi-sc-nerf traits`: ENVI library (.sli) or CSV."""
     angle_rad: float = between(1e-6, math.pi, default=paper.CLASSIFICATION_ANGLE_RAD)
     """Largest spectral angle, in radians, between a spectrum and the mixture of its classes."""
-    smallest_region_cm2: float = 0.05
+    smallest_region_cm2: float = between(0.0, 1e6, default=0.05)
     """Regions below this area are left out."""
 
     def main(self) -> None:

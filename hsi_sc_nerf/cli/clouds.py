@@ -45,6 +45,7 @@ class CompareCommand:
         Raises:
             InputError: a file or a setting cannot be used, or the two cannot be aligned.
         """
+        check_options(self.config)
         require_writable(self.output_dir)
         console = Console(stderr=True)
 
@@ -87,7 +88,7 @@ class TraitsCommand:
     splits: int = between(0, math.inf, default=6)
     """Number of random splits of the cloud into halves, which are meshed separately for the uncertainty of the sizes;
     0 for sizes without uncertainty."""
-    max_incidence_deg: float = MAX_INCIDENCE_DEG
+    max_incidence_deg: float = between(1.0, 90.0, default=MAX_INCIDENCE_DEG)
     """Spectra come only from points that a camera sees at an incidence angle of at most this many degrees, because
     oblique pixels are mixed. Sizes come from all points."""
     library: Path | None = None
@@ -97,7 +98,7 @@ class TraitsCommand:
     """Names of the library's spectra to use. Default: all."""
     angle_rad: float = between(1e-6, math.pi, default=paper.CLASSIFICATION_ANGLE_RAD)
     """Largest spectral angle, in radians, between a spectrum and its class."""
-    smallest_region_cm2: float = 0.05
+    smallest_region_cm2: float = between(0.0, 1e6, default=0.05)
     """Connected regions of a class below this area are not listed (their area still counts)."""
     roi: Annotated[tuple[tuple[str, float, float, float, float], ...], tyro.conf.UseAppendAction] = ()
     """A region of interest: its name, x, y and z of its centre and its radius in metres. Repeat the option for each
@@ -115,7 +116,7 @@ class TraitsCommand:
     (docs/how-to/calibrations.md): a table (CSV) of coefficients, or one that names an ONNX model. May be repeated."""
     components: int = between(0, math.inf, default=0)
     """Look for so many principal components and endmembers, or as many as the noise supports if that is fewer."""
-    piece: int | None = None
+    piece: int | None = between(1, math.inf, default=None)
     """Of several objects, measure this one alone: 1 is the largest."""
 
     def main(self) -> None:

@@ -227,9 +227,9 @@ class ReportCommand:
     """comparison.json of `hsi-sc-nerf compare`. Default: the one in the run's folder."""
     traits: Path | None = None
     """traits.json of `hsi-sc-nerf traits`. Default: the one in the run's folder."""
-    views: int | None = None
+    views: int | None = between(1, math.inf, default=None)
     """Number of held-out views to render, evenly spread. Default: all."""
-    points: int = 50_000
+    points: int = between(1, math.inf, default=50_000)
     """Number of points to show; 50 000 need about 5 MB."""
     index: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """An index to show on the object, by its name (docs/how-to/indices.md), or as a formula of reflectances. May be
@@ -244,6 +244,7 @@ class ReportCommand:
         Raises:
             InputError: the run, its dataset or a file given cannot be used, or the report cannot be written.
         """
+        check_options(self)
         from hsi_sc_nerf.report.build import ReportSources, write_report
 
         run = self.run.parent if self.run.name == "config.yml" else self.run

@@ -26,6 +26,7 @@ from hsi_sc_nerf.batch.session_steps import (
 from hsi_sc_nerf.benchmark.steps import StepCost, own_cost, run_step, typed_command
 from hsi_sc_nerf.capture.session import is_session
 from hsi_sc_nerf.cli.light import sentences
+from hsi_sc_nerf.cli.step_words import check_words
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write, content_of, make_folder
 from hsi_sc_nerf.processing.session_checks import CHECKS_PATH
@@ -66,6 +67,7 @@ class RunCommand(SessionSettings):
             InputError: a step failed, there is no session, or the output folder holds something else.
         """
         check_options(self)
+        check_words(self)
         out = self.output_dir
         if not self.session.is_dir():
             raise InputError(f"{self.session}: is no folder; give that of a capture session.")
@@ -135,7 +137,7 @@ class DemoCommand:
     """pear, apple, maize, tomato, pepper, sphere, cylinder, or the path of a scene file."""
     iterations: int | None = between(1, math.inf, default=None)
     """Training steps of both stages together, in place of those of `--preset fast`."""
-    points: int = 60_000
+    points: int = between(1, math.inf, default=60_000)
     """Number of points of the cloud."""
 
     def main(self) -> None:
@@ -144,6 +146,7 @@ class DemoCommand:
         Raises:
             InputError: a step failed, or the folder cannot be used.
         """
+        check_options(self)
         console, out = Console(), self.output_dir
         logs = out / "logs"
         make_folder(out)
