@@ -15,6 +15,7 @@ from rich.markup import escape
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.options import CloudOptions
 from hsi_sc_nerf.files import require_writable
+from hsi_sc_nerf.packed.of_run import require_dataset_of_run
 from hsi_sc_nerf.settings_file import between, check_options
 
 _METRES = {"m": 1.0, "mm": 1e-3}
@@ -43,6 +44,7 @@ class ExportCommand:
         Raises:
             InputError: the run cannot be used, an option cannot be met, or the cloud cannot be written.
         """
+        require_dataset_of_run(self.load_config)
         from hsi_sc_nerf.export.cloud import run_name
         from hsi_sc_nerf.export.spectral_export import export_cloud
         from hsi_sc_nerf.models.trained_run import open_run
@@ -83,6 +85,7 @@ class SampleCommand:
                 written.
         """
         check_options(self)
+        require_dataset_of_run(self.load_config)
         from hsi_sc_nerf.export.cloud import run_name
         from hsi_sc_nerf.export.cloud_material import read_material
         from hsi_sc_nerf.export.sample_points import read_points, sample_points, write_sampled_ply
@@ -159,6 +162,7 @@ class RenderCommand:
         if self.cubes == "none" and not self.video:
             raise InputError("--cubes none without a --video leaves nothing to do; give one of the two.")
         require_writable(self.output_dir)
+        require_dataset_of_run(self.load_config)
         from hsi_sc_nerf.export.cloud_material import read_material
         from hsi_sc_nerf.files import atomic_write
         from hsi_sc_nerf.models.trained_run import open_run
@@ -245,11 +249,12 @@ class ReportCommand:
             InputError: the run, its dataset or a file given cannot be used, or the report cannot be written.
         """
         check_options(self)
-        from hsi_sc_nerf.report.build import ReportSources, write_report
-
         run = self.run.parent if self.run.name == "config.yml" else self.run
         output = self.output or run / "report.html"
         require_writable(output.parent)
+        require_dataset_of_run(run / "config.yml")
+        from hsi_sc_nerf.report.build import ReportSources, write_report
+
         sources = ReportSources(
             self.cloud, self.comparison, self.traits, self.views, self.points, self.index, self.calibration
         )
