@@ -65,7 +65,7 @@ def _state(session: Path, **values: object) -> None:
     (session / "session.json").write_text(json.dumps(content), encoding="utf-8")
 
 
-def _edit_cube(header: Path, change: Cubes) -> None:
+def edit_cube(header: Path, change: Cubes) -> None:
     """Change a cube's numbers; its header keeps what does not describe them."""
     cube = open_cube(header)
     counts = change(cube.read().astype(np.float32))
@@ -75,7 +75,8 @@ def _edit_cube(header: Path, change: Cubes) -> None:
     write_cube(header, counts, wavelengths_nm=cube.wavelengths_nm, extra_header=kept)
 
 
-def _header(capture: Path, prefix: str = "") -> Path:
+def header_of(capture: Path, prefix: str = "") -> Path:
+    """Of the cube of a capture, or of one of its references."""
     return capture / "capture" / f"{prefix}{capture.name}.hdr"
 
 
@@ -84,12 +85,12 @@ def _white(session: Path) -> Path:
 
 
 def _dark_level(session: Path) -> float:
-    return float(open_cube(_header(_white(session), "DARKREF_")).read().mean())
+    return float(open_cube(header_of(_white(session), "DARKREF_")).read().mean())
 
 
 def _white_light(session: Path) -> np.ndarray:
     """Counts above dark of the white, by band."""
-    white = open_cube(_header(_white(session))).read()
+    white = open_cube(header_of(_white(session))).read()
     lines, samples, _ = white.shape
     middle = white[lines // 4 : -lines // 4, samples // 4 : -samples // 4]
     return np.median(middle, axis=(0, 1)).astype(np.float32) - _dark_level(session)
@@ -152,7 +153,7 @@ def _upright_in_specim_iq_folders(session: Path, source: Path, other: Path) -> N
 
 def _light_in_dark(session: Path, source: Path, other: Path) -> None:
     light = 0.05 * _white_light(session)
-    _edit_cube(_header(frames_of(session)[3], "DARKREF_"), lambda counts: counts + light)
+    edit_cube(header_of(frames_of(session)[3], "DARKREF_"), lambda counts: counts + light)
 
 
 def _without_dark(session: Path, source: Path, other: Path) -> None:
@@ -171,8 +172,8 @@ def _slip(session: Path, source: Path, other: Path) -> None:
     for frame, later in zip(frames[first:], [*frames[first + 1 :], frames[0]], strict=True):
         shown, turned = _coverage(source, frame.name), _coverage(source, later.name)
         of_object = (np.maximum(shown, turned) > 0.0)[..., None]
-        counts = open_cube(_header(source / later.name)).read()
-        _edit_cube(_header(frame), lambda own, on=of_object, new=counts: np.where(on, new, own))
+        counts = open_cube(header_of(source / later.name)).read()
+        edit_cube(header_of(frame), lambda own, on=of_object, new=counts: np.where(on, new, own))
 
 
 def _shadow(session: Path, source: Path, other: Path) -> None:
@@ -184,7 +185,7 @@ def _shadow(session: Path, source: Path, other: Path) -> None:
             np.arange(on_object.shape[1]), weights=on_object.sum(axis=0)
         )
         factor = 1.0 - (1.0 - LIT) * on_object * left
-        _edit_cube(_header(frame), _light(lambda light, by=factor: light * by[..., None], dark))
+        edit_cube(header_of(frame), _light(lambda light, by=factor: light * by[..., None], dark))
 
 
 def _stretched(factor: float) -> Callable[[Path, Path, Path], None]:
@@ -205,19 +206,19 @@ def _stretched(factor: float) -> Callable[[Path, Path, Path], None]:
 
     def make(session: Path, source: Path, other: Path) -> None:
         for frame in frames_of(session):
-            _edit_cube(_header(frame), stretch)
+            edit_cube(header_of(frame), stretch)
 
     return make
 
 
 def _mirrored(session: Path, source: Path, other: Path) -> None:
     for header in session.rglob("*.hdr"):
-        _edit_cube(header, lambda counts: counts[:, ::-1])
+        edit_cube(header, lambda counts: counts[:, ::-1])
 
 
 def _grey_card(session: Path, source: Path, other: Path) -> None:
     dark = _dark_level(session)
-    _edit_cube(_header(_white(session)), _light(lambda light: 0.4 * light, dark))
+    edit_cube(header_of(_white(session)), _light(lambda light: 0.4 * light, dark))
 
 
 def _half_in_shade(session: Path, source: Path, other: Path) -> None:
@@ -226,15 +227,15 @@ def _half_in_shade(session: Path, source: Path, other: Path) -> None:
     def shade(light: np.ndarray) -> np.ndarray:
         return light * np.where(np.arange(light.shape[1]) < light.shape[1] // 2, LIT, 1.0)[:, None]
 
-    _edit_cube(_header(_white(session)), _light(shade, dark))
+    edit_cube(header_of(_white(session)), _light(shade, dark))
 
 
 def _room_lamp(session: Path, source: Path, other: Path) -> None:
     dark = _dark_level(session)
-    nm = open_cube(_header(_white(session))).wavelengths_nm
+    nm = open_cube(header_of(_white(session))).wavelengths_nm
     factor = 1.0 + LINE_HEIGHT * sum(np.exp(-0.5 * ((nm - line) / LINE_WIDTH_NM) ** 2) for line in LINES_NM)
     for frame in frames_of(session):
-        _edit_cube(_header(frame), _light(lambda light: light * factor, dark))
+        edit_cube(header_of(frame), _light(lambda light: light * factor, dark))
 
 
 def _nan_bands(session: Path, source: Path, other: Path) -> None:
@@ -247,7 +248,7 @@ def _nan_bands(session: Path, source: Path, other: Path) -> None:
         return counts
 
     for header in session.rglob("*.hdr"):
-        _edit_cube(header, drop)
+        edit_cube(header, drop)
 
 
 def _sized(factor: float, container: bool) -> Callable[[Path, Path, Path], None]:
@@ -271,14 +272,14 @@ def _other_direction(session: Path, source: Path, other: Path) -> None:
 def _half_exposed(session: Path, source: Path, other: Path) -> None:
     dark = _dark_level(session)
     for frame in frames_of(session):
-        _edit_cube(_header(frame), _light(lambda light: 0.5 * light, dark))
+        edit_cube(header_of(frame), _light(lambda light: 0.5 * light, dark))
 
 
 def _veil(fraction: float) -> Callable[[Path, Path, Path], None]:
     def make(session: Path, source: Path, other: Path) -> None:
         light = fraction * _white_light(session)
         for frame in frames_of(session):
-            _edit_cube(_header(frame), lambda counts: counts + light)
+            edit_cube(header_of(frame), lambda counts: counts + light)
 
     return make
 

@@ -3,7 +3,8 @@
     uv run python benchmarks/session_mistakes.py --output-dir OUT
 
 The sessions are the path-traced one of benchmarks/independent_session.py and one of our own simulator. Each mistake
-is made in a copy. Where `process` ends with status 0, its dataset is compared with the truth.
+is made in a copy. Odd objects (odd_objects.py) are sessions of their own. Where `process` ends with status 0, its
+dataset is compared with the truth.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from mistakes import MISTAKES, WALL, Mistake, edit_headers, replaced_frames
+from mistakes import MISTAKES, WALL, Mistake, edit_headers, nothing, replaced_frames
+from odd_objects import ODD, odd_session
 from results_table import RESULTS, write_results
 from session_truth import SessionTruth
 
@@ -44,6 +46,8 @@ COLUMNS = [
 ]
 SIZE_PX, FRAMES = 112, 24
 EFFECTS = ("photon_noise", "read_noise", "dark_pattern", "chamber_shading", "lamp_drift")
+ODD_SCENES = {"pear": 41, "apple": 42}
+"""Scenes and seeds of the odd objects. Limits were chosen on the pears."""
 LONGEST_SENTENCE = 200
 
 
@@ -55,7 +59,7 @@ class SessionMistakes:
     """Folder for the sessions and datasets; sessions that are there are used again."""
     independent: Path | None = None
     """An independent session that is there already."""
-    sessions: tuple[str, ...] = ("path-traced", "simulated")
+    sessions: tuple[str, ...] = ("path-traced", "simulated", "odd")
     """Which sessions."""
     only: tuple[str, ...] = ()
     """Only these mistakes, by name."""
@@ -66,6 +70,9 @@ class SessionMistakes:
         """Do what is missing, print the table, write it."""
         self.output_dir.mkdir(parents=True, exist_ok=True)
         for kind in self.sessions:
+            if kind == "odd":
+                self._odd_objects()
+                continue
             session, other = self._path_traced() if kind == "path-traced" else self._simulated(kind)
             for mistake in MISTAKES:
                 if self.only and mistake.name not in self.only:
@@ -77,6 +84,15 @@ class SessionMistakes:
                         continue
                     made_from, _ = self._simulated(f"{kind}-wall", ("textured_background",))
                 row = [kind, mistake.name, *self._judged(mistake, made_from, other)]
+                write_results("session_mistakes", COLUMNS, [row], keys=2, folder=self.results)
+
+    def _odd_objects(self) -> None:
+        for scene, seed in ODD_SCENES.items():
+            for odd in ODD:
+                if self.only and odd.name not in self.only:
+                    continue
+                session = odd_session(odd, scene, seed, self.output_dir / f"{scene}-{odd.name.replace(' ', '_')}")
+                row = [f"odd {scene}", odd.name, *self._judged(Mistake(odd.name, nothing), session, session)]
                 write_results("session_mistakes", COLUMNS, [row], keys=2, folder=self.results)
 
     def _path_traced(self) -> tuple[Path, Path]:

@@ -39,6 +39,11 @@ class SessionTruth:
                 lambda capture: coverage[capture],
             )
         truth = load_truth(session)
-        lamps = {name: np.prod([f[0, 0] for f in truth.light(name).illumination], axis=0) for name in truth.captures}
+        # Without lamps that change there are no factors.
+        even = np.ones(len(truth.wavelengths_nm))
+        lamps = {
+            name: np.prod([even, *(f[0, 0] for f in truth.light(name).illumination)], axis=0)
+            for name in truth.captures
+        }
         poses = dict(zip(truth.captures, truth.camera_to_world, strict=True))
         return cls(poses, truth.intrinsics.fl_x, truth.wavelengths_nm, lamps, truth.object_coverage)

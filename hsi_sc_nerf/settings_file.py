@@ -23,7 +23,7 @@ _LARGEST_NUMBER = {int: 2**63, float: math.inf}
 
 
 def between(low: float, high: float, **kwargs: Any) -> Any:
-    """A dataclass field whose value must lie in [low, high]; ``high`` may be infinite."""
+    """A dataclass field whose value, or each of them, must lie in [low, high]; ``high`` may be infinite."""
     return field(metadata={"range": (low, high)}, **kwargs)
 
 
@@ -154,10 +154,8 @@ def _outside_range(values: Any, prefix: str) -> Iterator[tuple[str, float, str]]
             yield from _outside_range(value, f"{prefix}{f.name}.")
         elif "range" in f.metadata and value is not None:
             low, high = f.metadata["range"]
-            # Written so that NaN fails as well.
-            if not low <= value <= high:
-                yield (
-                    prefix + f.name,
-                    value,
-                    f"lie between {low:g} and {high:g}" if high < math.inf else f"be at least {low:g}",
-                )
+            limits = f"lie between {low:g} and {high:g}" if high < math.inf else f"be at least {low:g}"
+            for one in value if isinstance(value, tuple) else (value,):
+                # Written so that NaN fails as well.
+                if not low <= one <= high:
+                    yield prefix + f.name, one, limits

@@ -44,7 +44,7 @@ class MeshConfig:
     """Depth of the Poisson reconstruction's octree: each step halves the mesh's triangles in size."""
     smoothing_radius_m: float = between(1e-6, 1.0, default=0.002)
     """Surface details smaller than this, in metres, are smoothed away as noise of the reconstruction."""
-    base_height_m: float | None = None
+    base_height_m: float | None = between(-10.0, 10.0, default=None)
     """Height of the object's base above the turntable's disc, in metres (the container's height), where the unseen
     base is closed. Default: the lowest point of the cloud's edge."""
 

@@ -113,9 +113,7 @@ def measure_traits(
         >>> found.size.volume_l, found.traits.regions[0].maps["PRI"].surface.mean
         (0.21, 0.04)
     """
-    config = MeshConfig() if mesh is None else mesh
-    if config.base_height_m is None and dataset is not None and dataset.container is not None:
-        config = replace(config, base_height_m=dataset.container.height_m)
+    config = on_container(MeshConfig() if mesh is None else mesh, dataset)
     cloud = one_piece(cloud, piece, config)
     picked = [RegionOfInterest(name, (x, y, z), radius) for name, (x, y, z, radius) in (regions or {}).items()]
     found_indices = find_indices(indices, cloud.wavelengths_nm)
@@ -144,3 +142,10 @@ def measure_traits(
         unsupervised = find_components(surface, components) if components else None
     settings = {**asdict(config), "splits": splits, "max_incidence_deg": max_incidence_deg}
     return Measurement(surface, size_of(closed), uncertainty, traits, unsupervised, settings)
+
+
+def on_container(mesh: MeshConfig, dataset: PackedDataset | None) -> MeshConfig:
+    """Settings of the mesh; the height of the dataset's container is that of the base, unless they give one."""
+    if mesh.base_height_m is not None or dataset is None or dataset.container is None:
+        return mesh
+    return replace(mesh, base_height_m=dataset.container.height_m)

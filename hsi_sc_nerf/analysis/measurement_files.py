@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from hsi_sc_nerf.analysis import pictures, report
 from hsi_sc_nerf.analysis.library import write_library
@@ -13,13 +14,16 @@ from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.spectra import available_composites
 
 
-def write_measurement(folder: Path | str, measured: Measurement, name: str) -> None:
+def write_measurement(folder: Path | str, measured: Measurement, name: str) -> dict[str, Any]:
     """Write pictures, mesh and tables, and last ``traits.md``, the page that links them.
 
     Args:
         folder: to write to.
         measured: the traits.
         name: of the cloud, which the page states.
+
+    Returns:
+        The content of ``traits.json``.
 
     Raises:
         InputError: the files cannot be written.
@@ -70,3 +74,4 @@ def write_measurement(folder: Path | str, measured: Measurement, name: str) -> N
     content = replace(measured, settings={"cloud": name, **measured.settings}).content()
     write_json(folder / "traits.json", content)
     report.write_page(folder / "traits.md", name, content, drawn)
+    return content

@@ -28,6 +28,8 @@ SIZES = {
     "smallest_diameter_m": ("smallest diameter", "mm", 1e3),
     "equivalent_diameter_m": ("diameter of the sphere of equal volume", "mm", 1e3),
 }
+PIECES = "pieces"
+"""Key of ``traits.json`` that holds the traits of each of several objects, in place of those of one."""
 _CAUSES = {
     "points": "the scatter of the points",
     "base": "the unseen base",
@@ -121,6 +123,18 @@ def component_content(components: Components) -> dict[str, Any]:
         "variance_fractions": components.variance_fractions.tolist(),
         "mean_fractions": np.nanmean(components.fractions, axis=0).tolist(),
     }
+
+
+def each_object(content: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Of the content of ``traits.json`` that of each object: of one, itself.
+
+    Raises:
+        ValueError: it holds none.
+    """
+    pieces = content.get(PIECES, [content])
+    if not isinstance(pieces, list) or not pieces or not all(isinstance(one, Mapping) for one in pieces):
+        raise ValueError(f"{PIECES} is no list of traits")
+    return pieces
 
 
 def trait_tables(content: Mapping[str, Any]) -> list[TraitTable]:

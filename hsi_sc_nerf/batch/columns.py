@@ -84,6 +84,17 @@ STATUS = Column(
 )
 STEP = Column("step", "", "the step that failed or whose result is damaged", "status", "text")
 SENTENCE = Column("sentence", "", "what was wrong there, and what to do", "status", "text")
+PIECE = Column(
+    "piece",
+    "",
+    "number of the object among those that stand on the table, 1 the largest; times and memory, which all of a "
+    "session share, stand in its first row",
+    "status",
+)
+"""Only in tables with such a session, and so are the next two."""
+PIECE_AT = tuple(
+    Column(f"piece_{axis}_mm", "mm", f"{axis} of the middle of the piece, object frame", "status") for axis in "xy"
+)
 SIZE = {
     key: measured(key.rpartition("_")[0], unit, name + _NOTES.get(key, ""), "size", _SD)
     for key, (name, unit, _) in SIZES.items()

@@ -1,4 +1,4 @@
-"""One object's row of the table, from the files of its folder; whatever is damaged there becomes its status."""
+"""A session's rows of the table, one an object, from the files of its folder; damage becomes their status."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from hsi_sc_nerf.analysis.report import SIZES
+from hsi_sc_nerf.analysis.report import SIZES, each_object
 from hsi_sc_nerf.analysis.traits import WHOLE
 from hsi_sc_nerf.batch import columns
 from hsi_sc_nerf.batch.columns import Column, Value
@@ -22,9 +22,9 @@ from hsi_sc_nerf.processing.session_checks import CHECKS_PATH
 
 _AGAIN = "delete it and start the batch again"
 _LEVELS = ("green", "amber", "red")
-_CM2_PER_M2 = 1e4
+_CM2_PER_M2, _MM_PER_M = 1e4, 1e3
 Cells = dict[Column, Value]
-Tells = Callable[[dict[str, Any]], Iterator[tuple[Column, Value]]]
+Tells = Callable[[Mapping[str, Any]], Iterator[tuple[Column, Value]]]
 """What is to be read from the content of a file."""
 
 
@@ -47,23 +47,28 @@ class ObjectRow:
     report: Path | None
 
 
-def read_object(folder: Path) -> ObjectRow:
-    """The row of the object whose results lie in ``folder``; nothing there can make it fail.
+def read_objects(folder: Path) -> list[ObjectRow]:
+    """The row of the object whose results lie in ``folder``, or of each of several that stood on the table.
+
+    Nothing there can make it fail.
 
     Example:
-        >>> row = read_object(Path("season/objects/pear_01"))
+        >>> (row,) = read_objects(Path("season/objects/pear_01"))
         >>> row.cells[STATUS]
         'done'
     """
     wrong: list[_Trouble] = []
 
-    def tried(step: str, path: Path, tells: Tells) -> Cells:
-        """What a file tells; nothing where it is not there or damaged."""
+    def each_tried(step: str, path: Path, tells: Tells) -> list[Cells]:
+        """What a file tells of each object; nothing where it is not there or damaged."""
         try:
             return _read(path, step, tells)
         except InputError as error:
             wrong.append(_Trouble("damaged", step, str(error).replace(f"{folder}/", "")))
-            return {}
+            return [{}]
+
+    def tried(step: str, path: Path, tells: Tells) -> Cells:
+        return each_tried(step, path, tells)[0]
 
     cells: Cells = {}
     for step in STEPS:
@@ -74,36 +79,45 @@ def read_object(folder: Path) -> ObjectRow:
     failed = [one.step for one in wrong if one.status == "failed" and one.step not in OPTIONAL_STEPS]
     # What lies there of later steps is of an earlier attempt.
     lost = STEPS[STEPS.index(failed[0]) :] if failed else ()
+    costs: Cells = {}
     for total, parts, combined in ((columns.TOTAL, columns.SECONDS, math.fsum), (columns.PEAK, columns.MEMORY, max)):
         known = [value for column in parts.values() if isinstance(value := cells.get(column), float)]
         if known:
-            cells[total] = combined(known)
+            costs[total] = combined(known)
+    of_cost = {*columns.SECONDS.values(), *columns.MEMORY.values()}
+    costs |= {column: cells.pop(column) for column in tuple(cells) if column in of_cost}
 
     checks = folder / "data" / CHECKS_PATH
     cells |= tried("inspect", checks if checks.is_file() else folder / INSPECTION_NAME, _findings)
-    traits = {} if "traits" in lost else tried("traits", folder / "traits" / "traits.json", _traits)
+    pieces: list[Cells] = [{}]
+    if "traits" not in lost:
+        pieces = each_tried("traits", folder / "traits" / "traits.json", _traits)
     scores = {} if "evaluate" in lost else tried("evaluate", folder / "eval.json", _scores)
     serious = [one for one in wrong if one.status == "damaged" or one.step not in OPTIONAL_STEPS]
-    status = serious[0].status if serious else "done" if traits and scores else "unfinished"
+    status = serious[0].status if serious else "done" if pieces[0] and scores else "unfinished"
     told = (serious or wrong or [_Trouble("", "", "")])[0]
     state: Cells = {columns.STATUS: status, columns.STEP: told.step, columns.SENTENCE: told.sentence}
-    report = folder / "report.html"
-    return ObjectRow(cells | traits | scores | state, report if report.is_file() and "report" not in lost else None)
+    path = folder / "report.html"
+    report = path if path.is_file() and "report" not in lost else None
+    return [
+        ObjectRow(cells | (costs if number == 0 else {}) | traits | scores | state, report)
+        for number, traits in enumerate(pieces)
+    ]
 
 
-def _read(path: Path, step: str, tells: Tells) -> Cells:
-    """What a file tells; nothing where it is not there.
+def _read(path: Path, step: str, tells: Tells) -> list[Cells]:
+    """What a file tells of each object; nothing where it is not there.
 
     Raises:
         InputError: it is damaged.
     """
     if not path.is_file():
-        return {}
+        return [{}]
     with content_of(path, f"results of the step {step}", _AGAIN):
-        return dict(tells(read_json(path, _AGAIN)))
+        return [dict(tells(one)) for one in each_object(read_json(path, _AGAIN))]
 
 
-def _cost(step: str, content: dict[str, Any]) -> Iterator[tuple[Column, Value]]:
+def _cost(step: str, content: Mapping[str, Any]) -> Iterator[tuple[Column, Value]]:
     """Of a step: whether it was done, failed or was skipped after a failure; the sentence; time and memory."""
     yield columns.STATUS, str(content["status"])
     # As an error's text it is one line, of a length that can be read.
@@ -113,7 +127,11 @@ def _cost(step: str, content: dict[str, Any]) -> Iterator[tuple[Column, Value]]:
     yield columns.MEMORY[step], _number(content.get("peak_memory_mib")) or None
 
 
-def _traits(content: dict[str, Any]) -> Iterator[tuple[Column, Value]]:
+def _traits(content: Mapping[str, Any]) -> Iterator[tuple[Column, Value]]:
+    if "piece" in content:
+        yield columns.PIECE, _number(content["piece"])
+        for column, at in zip(columns.PIECE_AT, content["centre_m"], strict=False):
+            yield column, _number(at, _MM_PER_M)
     closed = bool(content["watertight"])
     for key, (_, _, factor) in SIZES.items():
         value, sd = columns.SIZE[key]
@@ -157,12 +175,12 @@ def _classes(classes: Mapping[str, Any], seen_m2: float) -> Iterator[tuple[Colum
         yield mixture, _number(mixtures_m2[name], 1.0 / seen_m2)
 
 
-def _scores(content: dict[str, Any]) -> Iterator[tuple[Column, Value]]:
+def _scores(content: Mapping[str, Any]) -> Iterator[tuple[Column, Value]]:
     for key, column in columns.SCORES.items():
         yield column, _number(content["results"][key])
 
 
-def _findings(content: dict[str, Any]) -> Iterator[tuple[Column, Value]]:
+def _findings(content: Mapping[str, Any]) -> Iterator[tuple[Column, Value]]:
     levels = [(_LEVELS.index(finding["level"]), str(finding["name"])) for finding in content["findings"]]
     if levels:
         yield columns.QUALITY, _LEVELS[max(levels)[0]]

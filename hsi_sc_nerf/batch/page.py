@@ -137,6 +137,7 @@ def _payload(table: Table, out: Path, done: Callable[[int], None] | None) -> dic
     ]
     names = [column.name for column in table.columns]
     object_at = names.index(OBJECT)
+    has_pieces = any(_bare(column) == _bare(columns.PIECE) for column in table.columns)
     pictures = []
     for number, row in enumerate(table.rows, start=1):
         pictures.append(thumbnail(out / OBJECTS_NAME / str(row[object_at]) / "data"))
@@ -148,7 +149,8 @@ def _payload(table: Table, out: Path, done: Callable[[int], None] | None) -> dic
         "pictures": pictures,
         "reports": [path and quote(path.relative_to(out).as_posix()) for path in table.reports],
         "places": {"object": object_at, "session": names.index(SESSION)}
-        | {name: _place(table, column) for name, column in _SPECIAL.items()},
+        | {name: _place(table, column) for name, column in _SPECIAL.items()}
+        | ({"piece": _place(table, columns.PIECE)} if has_pieces else {}),
     }
 
 

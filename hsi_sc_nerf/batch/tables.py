@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hsi_sc_nerf.batch.columns import GROUPS, STANDING, Column, Value
-from hsi_sc_nerf.batch.objects import read_object
+from hsi_sc_nerf.batch.objects import read_objects
 from hsi_sc_nerf.batch.plan import LIST_NAME, OBJECTS_NAME
 from hsi_sc_nerf.batch.session_list import OBJECT, SESSION, Row, read_sessions
 from hsi_sc_nerf.errors import InputError
@@ -62,20 +62,17 @@ def read_table(out: Path, done: Callable[[int], None] | None = None) -> Table:
     sessions = listed_sessions(out)
     header, found = [*sessions[0]], []
     for number, session in enumerate(sessions, start=1):
-        found.append(read_object(out / OBJECTS_NAME / session[OBJECT]))
+        found += [(session, row) for row in read_objects(out / OBJECTS_NAME / session[OBJECT])]
         if done is not None:
             done(number)
-    names = named_apart(header, {column for row in found for column in row.cells})
+    names = named_apart(header, {column for _, row in found for column in row.cells})
     given = []
     for name in header:
         meaning, values = _MEANINGS.get(name, "column of the list of sessions"), [one[name] for one in sessions]
         numbers = name not in _MEANINGS and any(values) and all(not v or _NUMBER.fullmatch(v) for v in values)
         given.append(Column(name, "", meaning, "list", "number" if numbers else "text"))
-    rows = [
-        [*session.values(), *(row.cells.get(column) for column in names)]
-        for session, row in zip(sessions, found, strict=True)
-    ]
-    return Table((*given, *names.values()), rows, [row.report for row in found])
+    rows = [[*session.values(), *(row.cells.get(column) for column in names)] for session, row in found]
+    return Table((*given, *names.values()), rows, [row.report for _, row in found])
 
 
 def listed_sessions(out: Path) -> list[Row]:

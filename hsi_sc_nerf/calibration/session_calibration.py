@@ -32,7 +32,7 @@ from hsi_sc_nerf.calibration.lamp_drift import (
 )
 from hsi_sc_nerf.calibration.noise import NoiseModel, measure_noise, reflectance_uncertainty
 from hsi_sc_nerf.calibration.reflectance import FrameCalibration
-from hsi_sc_nerf.calibration.white_reference import Roi, White, WhiteReference, tarp_roi
+from hsi_sc_nerf.calibration.white_reference import White, WhiteReference, tarp_roi
 from hsi_sc_nerf.calibration.white_source import (
     WhiteSource,
     exposure_ratio,
@@ -46,6 +46,7 @@ from hsi_sc_nerf.capture.envi import Cube
 from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import LARGEST_REFLECTANCE, ReflectanceUncertainty
+from hsi_sc_nerf.settings_file import between
 
 DEFECT_FRAMES, DEFECT_LINES, DEFECT_WHITE_LINES = 6, 4, 128
 HIGHLIGHT_BANDS = 12
@@ -60,13 +61,13 @@ class CalibrationConfig:
     """Where the white is: in a capture of its own (tarp), in the WHITEREF cube of each capture (capture), or in every
     frame at --calibration.roi (target). Product takes the instrument's own REFLECTANCE cubes and needs no white. Auto
     takes the first of tarp, capture and product that the session has."""
-    roi: Roi | None = None
+    roi: tuple[int, int, int, int] | None = between(0, 10**6, default=None)
     """Region of the white in the image as the file holds it: x0 y0 x1 y1 in pixels, x1 and y1 excluded. By default, a
     tarp is found by its brightness; a white target needs this."""
     panel: Path | None = None
     """CSV file with the white's own reflectance by wavelength (nm, and a fraction or percent). By default, the white
     has reflectance 1 in all bands."""
-    bounds: tuple[float, float] = paper.REFLECTANCE_BOUNDS
+    bounds: tuple[float, float] = between(-100.0, 100.0, default=paper.REFLECTANCE_BOUNDS)
     """Reflectance is clipped to this range."""
     flat_field: bool = False
     """Divide by the falloff of the light over the image, as the tarp shows it."""

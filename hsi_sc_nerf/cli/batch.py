@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,8 +16,9 @@ from rich.markup import escape
 
 from hsi_sc_nerf import batch
 from hsi_sc_nerf.batch.plan import STEPS, outdated, read_plan, unlisted, write_plan
-from hsi_sc_nerf.batch.session_list import Row, read_sessions
+from hsi_sc_nerf.batch.session_list import OBJECT, Row, read_sessions
 from hsi_sc_nerf.batch.session_steps import SessionSettings
+from hsi_sc_nerf.cli.step_words import check_words
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import read_json, require_writable
 from hsi_sc_nerf.settings_file import check_options
@@ -69,6 +70,13 @@ class BatchCommand(SessionSettings):
         if find_spec("snakemake") is None:
             raise InputError("Snakemake is not installed; pip install 'hsi-sc-nerf[batch]' (Python 3.11 or newer).")
         out, rows = self.output_dir, read_sessions(self.sessions)
+        check_words(self)
+        for row in rows:
+            if row.get("process"):
+                try:
+                    check_words(replace(self, process=f"{self.process} {row['process']}"))
+                except InputError as error:
+                    raise InputError(f"the object {row[OBJECT]}: {error}") from error
         if any((out / ".snakemake" / "locks").glob("*")) and not {"--unlock", "--nolock"} & {*self.other_words}:
             raise InputError(
                 f"{out}: another batch works there, or was killed; if none runs on any machine, start this one once "
@@ -181,7 +189,7 @@ class CollectCommand:
         with progress_bar("reading", "objects", count) as done:
             table = read_table(out, done)
         parquet = write_tables(table, out)
-        with progress_bar("pictures", "objects", count) as done:
+        with progress_bar("pictures", "objects", len(table.rows)) as done:
             page = write_overview(table, out, done)
         console = Console(highlight=False, soft_wrap=True)
         if not parquet:
@@ -189,4 +197,4 @@ class CollectCommand:
                 "[yellow]traits.parquet is not written, because pyarrow is not installed; run `pip install "
                 "'hsi-sc-nerf\\[batch]'` to have it."
             )
-        console.print(f"{count} objects. Open {escape(str(page))} in a browser; {CSV_NAME} holds the same.")
+        console.print(f"{len(table.rows)} objects. Open {escape(str(page))} in a browser; {CSV_NAME} holds the same.")

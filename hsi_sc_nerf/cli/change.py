@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import tyro
 from rich.console import Console
 from rich.markup import escape
@@ -15,6 +18,7 @@ from rich.progress import track
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
+from hsi_sc_nerf.analysis.standing_pieces import one_piece
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, SpectralCloud, read_spectral_ply, run_name
 from hsi_sc_nerf.files import require_writable
@@ -46,7 +50,7 @@ class ChangeCommand:
     repeat: Path | None = None
     """Another capture of the first day, for which the object was set down anew: a cloud, folder or run as for the
     days. It tells what setting down, poses and lamps alone make of the object; what is no larger is no change."""
-    band_nm: tuple[float, ...] = ()
+    band_nm: tuple[float, ...] = between(1.0, 1e5, default=())
     """Wavelengths (nm) whose reflectance is compared, beside spectra and indices."""
     index: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """An index to compare, by its name or as a formula, as for `hsi-sc-nerf traits`. May be repeated. Default: NDVI,
@@ -54,7 +58,10 @@ class ChangeCommand:
     session_std: float = between(0.0, 1.0, default=0.01)
     """Relative standard deviation of what the white references of two sessions make of one reflectance. It counts in
     what is said of the whole surface, not in what changed here and not there."""
-    max_incidence_deg: float = MAX_INCIDENCE_DEG
+    piece: tuple[int, ...] = between(1, math.inf, default=())
+    """Where several objects stand on the table, which of them: one number for all clouds, or one for each, a repeat
+    last. 1 is the largest, as for `hsi-sc-nerf traits`, which tells where each stands."""
+    max_incidence_deg: float = between(1.0, 90.0, default=MAX_INCIDENCE_DEG)
     """Spectra come only from points that a camera sees at an incidence angle of at most this many degrees."""
     library: Path | None = None
     """Reference spectra to classify the surface by, as for `hsi-sc-nerf traits`: ENVI library (.sli) or CSV. Regions
@@ -87,12 +94,13 @@ class ChangeCommand:
         names = [f"{day} {name}" for day, name in enumerate(_day_names(self.clouds), start=1)]
         if self.repeat:
             names.append(f"repeat {_day_name(self.repeat)}")
-            if files[-1].resolve() in [file.resolve() for file in files[:-1]]:
-                raise InputError(
-                    f"{self.repeat}: is one of the days itself; give --repeat another capture of the first."
-                )
+        _require_others(names, files, lambda one, other: bool(one.resolve() == other.resolve()))
+        if len(self.piece) not in (0, 1, len(files)):
+            raise InputError(f"--piece has {len(self.piece)} numbers; give one for all clouds, or {len(files)}.")
         console = Console(stderr=True)
         clouds = [_read(path) for path in track(files, "Reading", console=console, transient=True)]
+        _require_others(names, clouds, lambda one, other: np.array_equal(one.points, other.points))
+        clouds = _pieces(clouds, names, self.piece or (None,), self.mesh)
         indices = find_indices(self.index, clouds[0].wavelengths_nm)
         require_own_names(self.band_nm, indices)
         if library is not None:
@@ -138,6 +146,29 @@ def _file_of(path: Path) -> Path:
         if (folder / name).is_file():
             return folder / name
     raise InputError(f"{path}: holds no point_cloud.ply and no config.yml; give a cloud, or a folder of a run.")
+
+
+def _require_others(names: Sequence[str], given: Sequence[Any], are_same: Callable[[Any, Any], bool]) -> None:
+    """Refuse what is given twice, for nothing can have changed."""
+    for (name, one), (other_name, other) in itertools.combinations(zip(names, given, strict=True), 2):
+        if are_same(one, other):
+            raise InputError(
+                f"{other_name} is the same cloud as {name}, so nothing can have changed; give each day and --repeat "
+                "a capture of its own."
+            )
+
+
+def _pieces(
+    clouds: Sequence[SpectralCloud], names: Sequence[str], pieces: Sequence[int | None], mesh: MeshConfig
+) -> list[SpectralCloud]:
+    """Of each cloud the object of a number, or its only one."""
+    chosen = []
+    for cloud, name, piece in zip(clouds, names, itertools.cycle(pieces), strict=False):
+        try:
+            chosen.append(one_piece(cloud, piece, mesh))
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from error
+    return chosen
 
 
 def _read(path: Path) -> SpectralCloud:

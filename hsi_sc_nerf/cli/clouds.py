@@ -45,6 +45,7 @@ class CompareCommand:
         Raises:
             InputError: a file or a setting cannot be used, or the two cannot be aligned.
         """
+        check_options(self.config)
         require_writable(self.output_dir)
         console = Console(stderr=True)
 
@@ -70,7 +71,8 @@ class CompareCommand:
 class TraitsCommand:
     """Measure an object's size, and the spectra, indices and classes on its surface, from its spectral cloud.
 
-    Writes traits.md (start here), traits.json, spectra.csv, mesh.ply and pictures.
+    Writes traits.md (start here), traits.json, spectra.csv, mesh.ply and pictures. Where several objects stand on the
+    table (process --masks.pieces), each has its own in the folders piece-1 (the largest), piece-2 and so on.
     """
 
     cloud: tyro.conf.Positional[Path]
@@ -86,7 +88,7 @@ class TraitsCommand:
     splits: int = between(0, math.inf, default=6)
     """Number of random splits of the cloud into halves, which are meshed separately for the uncertainty of the sizes;
     0 for sizes without uncertainty."""
-    max_incidence_deg: float = MAX_INCIDENCE_DEG
+    max_incidence_deg: float = between(1.0, 90.0, default=MAX_INCIDENCE_DEG)
     """Spectra come only from points that a camera sees at an incidence angle of at most this many degrees, because
     oblique pixels are mixed. Sizes come from all points."""
     library: Path | None = None
@@ -113,8 +115,8 @@ class TraitsCommand:
     (docs/how-to/calibrations.md): a table (CSV) of coefficients, or one that names an ONNX model. May be repeated."""
     components: int = between(0, math.inf, default=0)
     """Look for so many principal components and endmembers, or as many as the noise supports if that is fewer."""
-    piece: int | None = None
-    """Where several objects stand on the table (process --masks.pieces), the one to measure: 1 is the largest."""
+    piece: int | None = between(1, math.inf, default=None)
+    """Of several objects, measure this one alone: 1 is the largest."""
 
     def main(self) -> None:
         """Measure and write.
@@ -124,8 +126,9 @@ class TraitsCommand:
         """
         from hsi_sc_nerf.analysis.drawn_regions import propose_regions, read_drawn_regions, write_drawn_regions
         from hsi_sc_nerf.analysis.library import read_library
-        from hsi_sc_nerf.analysis.measurement import measure_traits
-        from hsi_sc_nerf.analysis.measurement_files import write_measurement
+        from hsi_sc_nerf.analysis.measured_pieces import measure_pieces, write_pieces
+        from hsi_sc_nerf.analysis.measurement import on_container
+        from hsi_sc_nerf.analysis.standing_pieces import standing_pieces
         from hsi_sc_nerf.export.cloud import read_spectral_ply
         from hsi_sc_nerf.packed.dataset import open_packed
 
@@ -139,9 +142,12 @@ class TraitsCommand:
         if library is not None and self.classes:
             library = library.only(self.classes)
         cloud = read_spectral_ply(self.cloud)
-        measured = measure_traits(
+        dataset = None if self.data is None else open_packed(self.data)
+        if self.propose_regions and len(standing_pieces(cloud.points, on_container(self.mesh, dataset))) > 1:
+            raise InputError("--propose-regions looks at clouds of one object, and this has several; leave it out.")
+        measured = measure_pieces(
             cloud,
-            None if self.data is None else open_packed(self.data),
+            dataset,
             mesh=self.mesh,
             splits=self.splits,
             max_incidence_deg=self.max_incidence_deg,
@@ -156,7 +162,7 @@ class TraitsCommand:
         )
         console = Console(stderr=True)
         with console.status("tables and pictures"):
-            write_measurement(self.output_dir, measured, self.cloud.name)
+            write_pieces(self.output_dir, measured, self.cloud.name, self.piece)
         if self.propose_regions:
             with console.status("organs"):
                 proposed = propose_regions(cloud)

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from hsi_sc_nerf.export.cloud import LIGHT_COLUMNS
+from hsi_sc_nerf.packed.of_run import require_dataset_of_run
 from hsi_sc_nerf.settings_file import between, check_options
 
 if TYPE_CHECKING:
@@ -54,6 +55,7 @@ class MaterialCommand:
             InputError: cloud and run do not fit together or cannot be used, or the result cannot be written.
         """
         check_options(self)
+        require_dataset_of_run(self.load_config)
         from hsi_sc_nerf.export.cloud import band_property_names, read_spectral_ply, stream
         from hsi_sc_nerf.export.cloud_material import require_bands_of_run, with_material
         from hsi_sc_nerf.export.formats import format_of, require_format, write_cloud

@@ -15,6 +15,7 @@ from rich.markup import escape
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.options import CloudOptions
 from hsi_sc_nerf.files import require_writable
+from hsi_sc_nerf.packed.of_run import require_dataset_of_run
 from hsi_sc_nerf.settings_file import between, check_options
 
 _METRES = {"m": 1.0, "mm": 1e-3}
@@ -43,6 +44,7 @@ class ExportCommand:
         Raises:
             InputError: the run cannot be used, an option cannot be met, or the cloud cannot be written.
         """
+        require_dataset_of_run(self.load_config)
         from hsi_sc_nerf.export.cloud import run_name
         from hsi_sc_nerf.export.spectral_export import export_cloud
         from hsi_sc_nerf.models.trained_run import open_run
@@ -83,6 +85,7 @@ class SampleCommand:
                 written.
         """
         check_options(self)
+        require_dataset_of_run(self.load_config)
         from hsi_sc_nerf.export.cloud import run_name
         from hsi_sc_nerf.export.cloud_material import read_material
         from hsi_sc_nerf.export.sample_points import read_points, sample_points, write_sampled_ply
@@ -159,6 +162,7 @@ class RenderCommand:
         if self.cubes == "none" and not self.video:
             raise InputError("--cubes none without a --video leaves nothing to do; give one of the two.")
         require_writable(self.output_dir)
+        require_dataset_of_run(self.load_config)
         from hsi_sc_nerf.export.cloud_material import read_material
         from hsi_sc_nerf.files import atomic_write
         from hsi_sc_nerf.models.trained_run import open_run
@@ -227,9 +231,9 @@ class ReportCommand:
     """comparison.json of `hsi-sc-nerf compare`. Default: the one in the run's folder."""
     traits: Path | None = None
     """traits.json of `hsi-sc-nerf traits`. Default: the one in the run's folder."""
-    views: int | None = None
+    views: int | None = between(1, math.inf, default=None)
     """Number of held-out views to render, evenly spread. Default: all."""
-    points: int = 50_000
+    points: int = between(1, math.inf, default=50_000)
     """Number of points to show; 50 000 need about 5 MB."""
     index: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """An index to show on the object, by its name (docs/how-to/indices.md), or as a formula of reflectances. May be
@@ -244,11 +248,13 @@ class ReportCommand:
         Raises:
             InputError: the run, its dataset or a file given cannot be used, or the report cannot be written.
         """
-        from hsi_sc_nerf.report.build import ReportSources, write_report
-
+        check_options(self)
         run = self.run.parent if self.run.name == "config.yml" else self.run
         output = self.output or run / "report.html"
         require_writable(output.parent)
+        require_dataset_of_run(run / "config.yml")
+        from hsi_sc_nerf.report.build import ReportSources, write_report
+
         sources = ReportSources(
             self.cloud, self.comparison, self.traits, self.views, self.points, self.index, self.calibration
         )

@@ -14,6 +14,7 @@ import tyro
 from rich.console import Console
 from rich.markup import escape
 
+from hsi_sc_nerf.analysis.report import each_object
 from hsi_sc_nerf.batch.session_steps import (
     MATERIAL_NAME,
     STEPS_NAME,
@@ -25,6 +26,7 @@ from hsi_sc_nerf.batch.session_steps import (
 from hsi_sc_nerf.benchmark.steps import StepCost, own_cost, run_step, typed_command
 from hsi_sc_nerf.capture.session import is_session
 from hsi_sc_nerf.cli.light import sentences
+from hsi_sc_nerf.cli.step_words import check_words
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write, content_of, make_folder
 from hsi_sc_nerf.processing.session_checks import CHECKS_PATH
@@ -65,6 +67,7 @@ class RunCommand(SessionSettings):
             InputError: a step failed, there is no session, or the output folder holds something else.
         """
         check_options(self)
+        check_words(self)
         out = self.output_dir
         if not self.session.is_dir():
             raise InputError(f"{self.session}: is no folder; give that of a capture session.")
@@ -98,9 +101,11 @@ def _show_results(out: Path, console: Console) -> None:
     scores = "SAM {sam:.4f} rad, RMSE {rmse:.4f}, SSIM {ssim:.3f}, PSNR {psnr:.1f} dB".format(**results)
     console.print(f"Held-out views, inside the mask: {scores}")
     traits = json.loads((out / "traits" / "traits.json").read_text(encoding="utf-8"))
-    size = traits["size"]
-    volume = f"volume {1000 * size['volume_l']:.1f} mL" if traits["watertight"] else "no closed volume"
-    console.print(f"Size: height {1000 * size['height_m']:.1f} mm, area {1e4 * size['area_m2']:.1f} cm², {volume}")
+    for one in each_object(traits):
+        size, which = one["size"], f" of piece {one['piece']}" if "piece" in one else ""
+        volume = f"volume {1000 * size['volume_l']:.1f} mL" if one["watertight"] else "no closed volume"
+        height_mm, area_cm2 = 1000 * size["height_m"], 1e4 * size["area_m2"]
+        console.print(f"Size{which}: height {height_mm:.1f} mm, area {area_cm2:.1f} cm², {volume}")
     if (out / MATERIAL_NAME).is_file():
         console.print(f"Light: {sentences(json.loads((out / MATERIAL_NAME).read_text(encoding='utf-8')))[0]}")
     for line in _warnings(out):
@@ -132,7 +137,7 @@ class DemoCommand:
     """pear, apple, maize, tomato, pepper, sphere, cylinder, or the path of a scene file."""
     iterations: int | None = between(1, math.inf, default=None)
     """Training steps of both stages together, in place of those of `--preset fast`."""
-    points: int = 60_000
+    points: int = between(1, math.inf, default=60_000)
     """Number of points of the cloud."""
 
     def main(self) -> None:
@@ -141,6 +146,7 @@ class DemoCommand:
         Raises:
             InputError: a step failed, or the folder cannot be used.
         """
+        check_options(self)
         console, out = Console(), self.output_dir
         logs = out / "logs"
         make_folder(out)

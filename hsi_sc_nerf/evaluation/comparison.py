@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,6 +23,7 @@ from hsi_sc_nerf.evaluation.spatial import (
     threshold_curves,
 )
 from hsi_sc_nerf.geometry.ply_file import ply_triangles, read_ply
+from hsi_sc_nerf.settings_file import between, check_options
 
 Alignment = Literal["features", "icp", "none"]
 Track = Callable[[Sequence[Any], str], Iterable[Any]]
@@ -51,9 +53,9 @@ class CompareConfig:
     The scores hold for each, but a point on the cloud need not be that point on the object."""
     reference_unit: Literal["m", "mm"] = "m"
     """Unit of length of the reference file."""
-    threshold_m: float = paper.F_SCORE_THRESHOLD_M
+    threshold_m: float = between(1e-9, 10.0, default=paper.F_SCORE_THRESHOLD_M)
     """Distance within which a point is correct, in metres; 0.002 is the paper's."""
-    points: int = 100_000
+    points: int = between(FEWEST_POINTS, math.inf, default=100_000)
     """Number of points sampled on a mesh, evenly over its area."""
     whole_reference: bool = False
     """With a simulated session: recall also counts the parts of the true surface that no view sees, such as the
@@ -222,10 +224,7 @@ def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _check(config: CompareConfig, alignment: Alignment) -> None:
-    if not config.threshold_m > 0:
-        raise InputError(f"--threshold-m is {config.threshold_m}; it must be more than 0.")
-    if config.points < FEWEST_POINTS:
-        raise InputError(f"--points is {config.points}; {FEWEST_POINTS} are needed at least.")
+    check_options(config)
     if config.with_scale and alignment == "none":
         raise InputError(
             "--with-scale changes the cloud's size while it is aligned, but --align is none (as for a simulated "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -13,9 +14,9 @@ from jaxtyping import Float, Int
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.formats import CloudFormat
+from hsi_sc_nerf.settings_file import between, check_options
 from hsi_sc_nerf.spectra import require_bands
 
-Vector = tuple[float, float, float]
 _RANGE = re.compile(r"(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)")
 _FIXED = {
     "reorient_normals": True,
@@ -31,14 +32,14 @@ searched around the median depth, and colours are the pseudo-RGB of the spectra.
 class CloudOptions:
     """How a cloud is made. Options that `ns-export pointcloud` has too keep its names and defaults."""
 
-    num_points: int = 1_000_000
+    num_points: int = between(1, math.inf, default=1_000_000)
     """Number of points, spread evenly over the surface. Removing outliers leaves slightly fewer."""
     bands: tuple[str, ...] = ()
     """Bands to keep: wavelengths in nm, such as 670, or ranges, such as 600-700. By default all."""
     format: CloudFormat = "ply"
     """File format. ply: opens in CloudCompare, MeshLab, Open3D. las: for GIS and laser scanning software. netcdf and
     zarr: tables that xarray opens, with wavelength as a coordinate."""
-    roi_box: tuple[float, float, float, float, float, float] | None = None
+    roi_box: tuple[float, float, float, float, float, float] | None = between(-100.0, 100.0, default=None)
     """Keep the points in a box: smallest x, y, z, then largest x, y, z, metres in the object frame (z along the
     turntable's axis, 0 on the disc)."""
     roi_masks: Path | None = None
@@ -48,27 +49,24 @@ class CloudOptions:
     """Keep the container and the turntable, which are cut away by default."""
     remove_outliers: bool = True
     """Remove points that lie unusually far from their neighbours."""
-    std_ratio: float = 10.0
+    std_ratio: float = between(1e-6, 1e6, default=10.0)
     """How many standard deviations above the average distance make an outlier."""
     normal_method: Literal["open3d", "model_output"] = "model_output"
     """Normals from neighbouring points (open3d), or from the gradient of the model's density."""
-    obb_center: Vector | None = None
+    obb_center: tuple[float, float, float] | None = between(-1e6, 1e6, default=None)
     """Centre of an oriented box to crop to, in nerfstudio's scene units; needs all three obb options."""
-    obb_rotation: Vector | None = None
+    obb_rotation: tuple[float, float, float] | None = between(-1e6, 1e6, default=None)
     """Rotation of that box: roll, pitch, yaw in radians."""
-    obb_scale: Vector | None = None
+    obb_scale: tuple[float, float, float] | None = between(1e-9, 1e6, default=None)
     """Sides of that box, scene units."""
-    num_rays_per_batch: int = 32768
+    num_rays_per_batch: int = between(1, 2**31, default=32768)
     """Rays rendered at a time; fewer need less memory."""
 
     def __post_init__(self) -> None:
         oriented_box = (self.obb_center, self.obb_rotation, self.obb_scale)
         if any(part is None for part in oriented_box) and any(part is not None for part in oriented_box):
             raise InputError("--obb-center, --obb-rotation and --obb-scale belong together; give all three or none.")
-        if self.num_points < 1 or self.num_rays_per_batch < 1:
-            raise InputError("--num-points and --num-rays-per-batch must be at least 1.")
-        if not self.std_ratio > 0.0:
-            raise InputError("--std-ratio must be greater than 0.")
+        check_options(self)
         box = self.roi_box
         if box is not None and any(low >= high for low, high in zip(box[:3], box[3:], strict=True)):
             raise InputError("--roi-box takes the smallest x, y and z first, then the largest; give six numbers so.")

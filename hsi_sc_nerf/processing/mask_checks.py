@@ -17,6 +17,9 @@ MAX_EMPTY_FRACTION = 0.05
 """Fraction of frames without a mask that is tolerated; the visual hull tolerates as many."""
 MAX_CUT_FRACTION = 0.3
 """Fraction of a mask's lines that may end at the side of the space where the object may be."""
+CUT_LINES, CUT_FRAMES = 0.05, 0.1
+"""A part of the object is cut off there where more than this fraction of a mask's lines end so, in more than this
+fraction of the frames."""
 MAX_CONTRADICTION = 0.04
 """Largest typical difference of mask and hull's silhouette (1 - intersection over union), to which a quarter of a
 pixel along the mask's outline is added. Good masks have half of it, because the hull is found by vote."""
@@ -105,6 +108,13 @@ def _border(masks: Bool[np.ndarray, "n h w"], regions: Bool[np.ndarray, "n h w"]
                 "report/masks.png."
             )
             found.append(Finding("masks-cut", "red", sentence, {"lines_fraction": float(np.median(cut))}))
+        elif (cut > CUT_LINES).mean() > CUT_FRAMES:
+            sentence = (
+                f"The masks end at the side of the space above the lid in {(cut > CUT_LINES).sum()} of {len(masks)} "
+                "frames, and what of the object reaches beyond it is cut off; raise --masks.overhang, or set the "
+                "object on the middle of the lid."
+            )
+            found.append(Finding("masks-cut", "amber", sentence, {"lines_fraction": float(cut.max())}))
     return found
 
 

@@ -25,6 +25,7 @@ from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, image_of, pixel_rays
 from hsi_sc_nerf.morphology import components, dilate, draw_outline, ellipse_close_open, fill_holes, touching
 from hsi_sc_nerf.packed.dataset import Container
 from hsi_sc_nerf.processing.foreground_score import background_subspace, foreground_score, otsu_threshold
+from hsi_sc_nerf.settings_file import between
 
 MIN_CONTRAST = 0.005
 """Smallest difference between the mean scores of object and background that Otsu's threshold is accepted with."""
@@ -56,17 +57,17 @@ _FACES = np.ones((3, 3), bool)
 class MaskConfig:
     """Settings of the foreground masks."""
 
-    threshold: float | None = None
+    threshold: float | None = between(1e-6, 10.0, default=None)
     """Foreground score (the part of the reflectance that the background's spectra cannot explain, RMS over the
     spectrum) from which a pixel is the object's. Otsu's threshold over all frames if not given."""
-    weak_fraction: float = 0.5
+    weak_fraction: float = between(0.0, 1.0, default=0.5)
     """Parts that stick out of the object (a stem) are added from this fraction of the threshold; 1 for none."""
-    shaded_fraction: float | None = 0.5
+    shaded_fraction: float | None = between(0.0, 10.0, default=0.5)
     """Pixels next to the object and darker than it are added where their score relative to their brightness is more
     than this fraction of the object's; None for none. Not applied next to even darker pixels."""
-    overhang: float = 1.2
+    overhang: float = between(0.01, 100.0, default=1.2)
     """The object may reach beyond the container's lid up to this multiple of the lid's radius."""
-    pieces: int = 1
+    pieces: int = between(1, 1000, default=1)
     """The object consists of up to so many pieces that are apart from each other (two berries, some grains). All of
     them are reconstructed together."""
 
@@ -82,15 +83,13 @@ def foreground_masks(
         regions: pixels of each frame that may be the object's (`above_lid`); all if not given.
 
     Raises:
-        InputError: the number of pieces is below 1; the spectra of object and background hardly differ.
+        InputError: the spectra of object and background hardly differ.
 
     Example:
         >>> masks, left_out = foreground_masks([smoothed_bins(binned)], MaskConfig())  # binned: (24, 512, 512)
         >>> masks.shape, left_out
         ((1, 512, 512), array([False]))
     """
-    if config.pieces < 1:
-        raise InputError(f"--masks.pieces is {config.pieces}, but must be 1 or more; correct it.")
     background = background_subspace(bins, regions)
     scores = [foreground_score(image, background) for image in bins]
     threshold = select_threshold(scores) if config.threshold is None else config.threshold

@@ -47,6 +47,7 @@ from hsi_sc_nerf.processing.masks import MaskConfig, above_lid, foreground_masks
 from hsi_sc_nerf.processing.posed_frames import PoseFunction, container_under, known_camera, pose_frames, posed_frames
 from hsi_sc_nerf.processing.session_checks import SessionChecks, require_checks
 from hsi_sc_nerf.processing.visual_hull import VotedHull, assumed_disc, object_box, scene_box, voted_hull
+from hsi_sc_nerf.settings_file import between, check_options
 from hsi_sc_nerf.spectra import nearest_bands
 
 OBJECT_PIXELS = 2000
@@ -61,7 +62,7 @@ class ProcessConfig:
     """White-reference calibration."""
     masks: MaskConfig = field(default_factory=MaskConfig)
     """Foreground masks."""
-    pseudo_rgb_nm: tuple[float, float, float] = paper.PSEUDO_RGB_NM
+    pseudo_rgb_nm: tuple[float, float, float] = between(1.0, 1e5, default=paper.PSEUDO_RGB_NM)
     """Wavelengths shown as red, green and blue, nm; the nearest bands are taken."""
     poses: PoseMethod = "auto"
     """How poses are found: from markers that turn with the object; from features of the object (colmap); from the
@@ -69,9 +70,9 @@ class ProcessConfig:
     camera: Path | None = None
     """An earlier dataset of the same camera and turntable: with known angles and its camera, poses need neither
     markers nor texture."""
-    marker_side_m: float | None = None
+    marker_side_m: float | None = between(1e-4, 0.5, default=None)
     """Side of a marker's black square, metres; session.json's if not given."""
-    workers: int = 2
+    workers: int = between(1, 1000, default=2)
     """Number of frames that are calibrated at the same time; each needs memory for about two copies of a raw cube."""
     exclude: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Name of a capture to leave out; may be given several times."""
@@ -114,8 +115,7 @@ def process_session(
     config, output_dir = config or ProcessConfig(), Path(output_dir)
     if output_dir.resolve() == Path(session_dir).resolve():
         raise InputError(f"{output_dir}: is the session itself; choose another --output-dir.")
-    if config.workers < 1:
-        raise InputError(f"--workers is {config.workers}, but must be 1 or more; correct it.")
+    check_options(config)
     require_checks(config.accept)
     require_writable(output_dir)
     # Square brackets and colons in a folder's name are no markup.

@@ -13,6 +13,7 @@ import numpy as np
 from hsi_sc_nerf.analysis.calibrations import Calibration, read_calibration
 from hsi_sc_nerf.analysis.class_maps import OUTSIDE
 from hsi_sc_nerf.analysis.drawn_regions import PAGE_POINTS, points_of_page
+from hsi_sc_nerf.analysis.report import each_object
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import INCIDENCE, MAX_INCIDENCE_DEG, SpectralCloud, read_spectral_ply
 from hsi_sc_nerf.files import atomic_write, content_of
@@ -93,7 +94,7 @@ def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
     comparison, traits = read_known(comparison_path), read_known(traits_path)
     results = [comparison_section(comparison, comparison_path), traits_section(traits, traits_path)]
     with content_of(traits_path, "traits"):
-        indices = [*sources.indices] or [str(word) for word in (traits or {}).get("indices", ())]
+        indices = [*sources.indices] or [str(word) for word in each_object(traits or {})[0].get("indices", ())]
     calibrations = [read_calibration(path) for path in sources.calibrations]
 
     from hsi_sc_nerf.models.trained_run import open_run

@@ -46,30 +46,34 @@ class HeldOutView:
 
 
 def render_held_out(run: TrainedRun, views: int) -> Iterator[HeldOutView]:
-    """Render ``views`` of the held-out views, evenly spread; one cube is in memory at a time."""
+    """Render ``views`` of the held-out views, evenly spread; the cubes of one are in memory at a time."""
+    for index in spread_of_views(len(run.manager.eval_dataset.frames), views):
+        yield _held_out_view(run, index)
+
+
+def _held_out_view(run: TrainedRun, index: int) -> HeldOutView:
+    """A function of its own, whose cubes are freed before the next view is rendered."""
     import torch
 
     manager, model = run.manager, run.model
-    frames = manager.eval_dataset.frames
-    for index in spread_of_views(len(frames), views):
-        camera, batch = manager.fixed_indices_eval_dataloader.get_camera(index)
-        with torch.no_grad():
-            rendered = model.get_outputs_for_camera(camera)["spectral"].cpu()
-        measured, mask = batch["spectral"].cpu(), batch["mask"].cpu()[..., 0].bool()
-        valid = batch["valid"].cpu() if "valid" in batch else torch.ones_like(measured, dtype=torch.bool)
-        radius_px = max(1.0, mask.shape[1] * _POINT_RADIUS)
-        yield HeldOutView(
-            score_view(frames[index].capture, rendered, measured, mask, valid),
-            measured[..., model.rgb_bands].numpy(),
-            rendered[..., model.rgb_bands].numpy(),
-            point_spectra(
-                measured.masked_fill(~valid, torch.nan).numpy(),
-                rendered.numpy(),
-                mask.numpy(),
-                inner_points(mask.numpy(), POINTS, round(2.0 * radius_px)),
-                radius_px,
-            ),
-        )
+    camera, batch = manager.fixed_indices_eval_dataloader.get_camera(index)
+    with torch.no_grad():
+        rendered = model.get_outputs_for_camera(camera)["spectral"].cpu()
+    measured, mask = batch["spectral"].cpu(), batch["mask"].cpu()[..., 0].bool()
+    valid = batch["valid"].cpu() if "valid" in batch else torch.ones_like(measured, dtype=torch.bool)
+    radius_px = max(1.0, mask.shape[1] * _POINT_RADIUS)
+    return HeldOutView(
+        score_view(manager.eval_dataset.frames[index].capture, rendered, measured, mask, valid),
+        measured[..., model.rgb_bands].numpy(),
+        rendered[..., model.rgb_bands].numpy(),
+        point_spectra(
+            measured.masked_fill(~valid, torch.nan).numpy(),
+            rendered.numpy(),
+            mask.numpy(),
+            inner_points(mask.numpy(), POINTS, round(2.0 * radius_px)),
+            radius_px,
+        ),
+    )
 
 
 @dataclass(frozen=True, eq=False)

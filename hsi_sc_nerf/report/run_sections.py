@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.analysis.report import trait_tables
+from hsi_sc_nerf.analysis.report import each_object, trait_tables
 from hsi_sc_nerf.evaluation.comparison_report import comparison_tables
 from hsi_sc_nerf.files import content_of
 from hsi_sc_nerf.findings import Finding, judged
@@ -271,18 +271,23 @@ def traits_section(traits: Mapping[str, Any] | None, source: Path) -> Section:
         command = "hsi-sc-nerf traits CLOUD.ply --output-dir RUN"
         return Section("traits", "Traits", [Missing("The object's traits were not measured.", command)])
     with content_of(source, "traits", "make them again with `hsi-sc-nerf traits`"):
-        tables, findings = trait_tables(traits), judge_traits(traits)
-    blocks = [Table(f"{table.heading}. {table.note}", table.header, table.rows) for table in tables]
+        blocks, findings = list[Block](), list[Finding]()
+        for one in each_object(traits):
+            which = f"Piece {one['piece']}. " if "piece" in one else ""
+            tables = trait_tables(one)
+            blocks += [Table(f"{which}{table.heading}. {table.note}", table.header, table.rows) for table in tables]
+            findings += judge_traits(one, which)
     return Section("traits", "Traits", blocks, findings)
 
 
-def judge_traits(traits: Mapping[str, Any]) -> list[Finding]:
-    """Whether the mesh encloses a volume, and how much of it was not seen."""
+def judge_traits(traits: Mapping[str, Any], which: str = "") -> list[Finding]:
+    """Whether the mesh encloses a volume, and how much of it was not seen; ``which`` of several objects it is."""
     if not traits["watertight"]:
-        return [Finding("watertight", "red", "The mesh has holes, so its volume cannot be trusted; mesh it anew.")]
+        sentence = f"{which}The mesh has holes, so its volume cannot be trusted; mesh it anew."
+        return [Finding("watertight", "red", sentence)]
     fraction = 1.0 - traits["seen_area_m2"] / traits["size"]["area_m2"]
     sentence = (
-        f"The mesh is closed; {100.0 * fraction:.1f} % of its area was not seen (good up to "
+        f"{which}The mesh is closed; {100.0 * fraction:.1f} % of its area was not seen (good up to "
         f"{100.0 * _UNSEEN_FRACTION:.0f} %)"
     )
     advice = "give the container's height (--data), and see which side was not seen"

@@ -5,11 +5,15 @@ import pytest
 from standing_sphere import RADIUS_M, STAND_M, sphere_points
 
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
+from hsi_sc_nerf.analysis.measured_pieces import measure_pieces, write_pieces
 from hsi_sc_nerf.analysis.measurement import measure_traits
+from hsi_sc_nerf.analysis.report import each_object
 from hsi_sc_nerf.analysis.standing_pieces import one_piece, standing_pieces
 from hsi_sc_nerf.cli.clouds import TraitsCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import SpectralCloud
+from hsi_sc_nerf.files import read_json
+from hsi_sc_nerf.report.run_sections import traits_section
 
 CONFIG = MeshConfig(octree_depth=6, base_height_m=STAND_M)
 
@@ -51,17 +55,30 @@ def test_what_is_no_object_of_its_own_belongs_to_the_other(second):
 
 
 @pytest.mark.slow
-def test_sizes_are_those_of_one_object():
+def test_each_object_is_measured_by_itself(tmp_path):
     points, normals, _ = balls((0.6, [-0.06, 0, 0]), (1.0, [0.06, 0, 0]))
     cloud = cloud_of(points, normals)
     with pytest.raises(InputError, match=r"2 objects that stand apart.*--piece 1 to --piece 2"):
         measure_traits(cloud, mesh=CONFIG, splits=0)
-    ball_l = 4000 * np.pi * RADIUS_M**3 / 3
-    for piece, volume_l in ((1, ball_l), (2, 0.6**3 * ball_l)):
-        measured = measure_traits(cloud, mesh=CONFIG, splits=0, piece=piece)
-        assert measured.size.volume_l == pytest.approx(volume_l, rel=0.02)
     with pytest.raises(InputError, match="--piece is 3, but the cloud holds 2; choose 1 to 2"):
         one_piece(cloud, 3, CONFIG)
+    regions = {"top of the small": (-0.06, 0, STAND_M + 1.2 * RADIUS_M, 0.01)}
+    measured = measure_pieces(cloud, mesh=CONFIG, splits=0, regions=regions)
+    write_pieces(tmp_path, measured, "two balls")
+    content = read_json(tmp_path / "traits.json", "")
+    ball_l = 4000 * np.pi * RADIUS_M**3 / 3
+    for number, (one, volume_l, x_m) in enumerate(
+        zip(each_object(content), (ball_l, 0.6**3 * ball_l), (0.06, -0.06), strict=True), start=1
+    ):
+        assert one["size"]["volume_l"] == pytest.approx(volume_l, rel=0.02)
+        assert one["centre_m"][0] == pytest.approx(x_m, abs=0.001)
+        assert one["piece"] == number
+        assert (tmp_path / f"piece-{number}" / "traits.md").is_file()
+        assert ("top of the small" in one["regions"]) == (number == 2)
+    section = traits_section(content, tmp_path / "traits.json")
+    captions = [table.caption for table in section.blocks]
+    assert [caption[:14] for caption in captions if "Size" in caption] == ["Piece 1. Size.", "Piece 2. Size."]
+    assert [finding.sentence[:7] for finding in section.findings] == ["Piece 1", "Piece 2"]
 
 
 def test_organs_are_proposed_of_clouds_of_one_object(tmp_path):

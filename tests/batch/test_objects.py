@@ -6,12 +6,12 @@ import shutil
 import pytest
 from batch_folder import traits_of, write_object
 
-from hsi_sc_nerf.batch.objects import read_object
+from hsi_sc_nerf.batch.objects import read_objects
 from hsi_sc_nerf.files import write_json
 
 
 def row_of(folder):
-    row = read_object(folder)
+    (row,) = read_objects(folder)
     return {column.name: value for column, value in row.cells.items()}, row.report
 
 
@@ -60,6 +60,20 @@ def test_a_row_has_what_the_files_say_in_the_columns_units(tmp_path):
         assert row[name] == (pytest.approx(value) if isinstance(value, float) else value), name
     assert row["wi"] is None  # null in the file
     assert (row["brix_percent"], row["brix_sd_percent"]) == (12.5, 0.4)
+
+
+def test_objects_that_stood_on_one_table_have_a_row_each(tmp_path):
+    pieces = [
+        {"piece": number, "centre_m": [0.02 * number, -0.01, 0.1], **traits_of(volume)}
+        for number, volume in ((1, 250.0), (2, 120.0))
+    ]
+    write_object(tmp_path / "berries", {"pieces": pieces})
+    rows = [{column.name: value for column, value in row.cells.items()} for row in read_objects(tmp_path / "berries")]
+    assert [row["volume_ml"] for row in rows] == [pytest.approx(250.0), pytest.approx(120.0)]
+    assert [(row["piece"], row["piece_x_mm"], row["status"]) for row in rows] == [(1, 20, "done"), (2, 40, "done")]
+    assert [row["sam_rad"] for row in rows] == [0.03, 0.03]
+    # They add up to those of all sessions.
+    assert [row.get("total_s") for row in rows] == [36.0, None]
 
 
 def test_areas_by_classifiers_have_columns_with_their_deviations(tmp_path):
@@ -132,6 +146,7 @@ def test_a_refused_session_has_the_findings_of_inspect(tmp_path):
         ("traits/traits.json", "traits", "{"),
         ("traits/traits.json", "traits", "[]"),
         ("traits/traits.json", "traits", '{"watertight": true}'),
+        ("traits/traits.json", "traits", '{"pieces": []}'),
         ("traits/traits.json", "traits", json.dumps(traits_of() | {"seen_area_m2": 0})),
         ("traits/traits.json", "traits", json.dumps(traits_of() | {"regions": {"whole surface": 3}})),
         ("traits/traits.json", "traits", json.dumps(traits_of() | {"size_sd": {"volume_l": 10**400}})),

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import av
 import ball_run
@@ -121,8 +122,11 @@ def test_a_trained_run_without_a_cloud_is_sampled_and_left_as_it_is(tmp_path, mo
     radius_m = np.linalg.norm(cloud.points - factory.SPHERE_CENTRE_M, axis=1)
     assert np.median(radius_m) == pytest.approx(factory.SPHERE_RADIUS_M, rel=0.03)
     assert np.abs(cloud.spectra - factory.PLANT).max() < 0.02
-    ChangeCommand((config, config.parent), tmp_path / "out", MeshConfig(octree_depth=5)).main()
-    rows = rows_of(tmp_path / "out", before="1 ball/hsi-sc-nerf/run", after="2 ball/hsi-sc-nerf/run")
+    (tmp_path / "later").mkdir()
+    later = replace(cloud, points=cloud.points + np.float32(1e-5))
+    write_spectral_ply(tmp_path / "later" / "point_cloud.ply", later)
+    ChangeCommand((config.parent, tmp_path / "later"), tmp_path / "out", MeshConfig(octree_depth=5)).main()
+    rows = rows_of(tmp_path / "out", before="1 ball/hsi-sc-nerf/run", after="2 later")
     assert rows
     assert {row["region"] for row in rows} == {"whole surface"}
     assert sorted(config.parent.rglob("*")) == before
@@ -152,8 +156,16 @@ def test_bad_input_is_one_sentence_and_nothing_is_written(clouds, tmp_path):
     write_spectral_ply(other, type(cloud)(*list(vars(cloud).values())[:3], cloud.spectra[:, :4], NM[:4]))
     with pytest.raises(InputError, match="2 other: has other bands than 1 monday"):
         ChangeCommand((first, other), out).main()
-    with pytest.raises(InputError, match="is one of the days itself"):
+    with pytest.raises(InputError, match="repeat point_cloud is the same cloud as 1 monday"):
         ChangeCommand((first, clouds / "friday"), out, repeat=first / "point_cloud.ply").main()
+    copied = tmp_path / "tuesday.ply"
+    copied.write_bytes((first / "point_cloud.ply").read_bytes())
+    with pytest.raises(InputError, match="2 tuesday is the same cloud as 1 monday"):
+        ChangeCommand((first, copied), out).main()
+    with pytest.raises(InputError, match="--piece has 3 numbers; give one for all clouds, or 2"):
+        ChangeCommand((first, clouds / "friday"), out, piece=(1, 2, 1)).main()
+    with pytest.raises(InputError, match="2 friday: --piece is 2, but the cloud holds 1"):
+        ChangeCommand((first, clouds / "friday"), out, piece=(1, 2)).main()
     with pytest.raises(InputError, match="session-std"):
         ChangeCommand((first, other), out, session_std=-1.0).main()
     assert not out.exists()

@@ -78,6 +78,12 @@ def test_masks_of_a_wall_are_cut_by_the_space_above_the_lid():
     assert findings(wall & REGIONS, regions=REGIONS)["masks-cut"] == "red"
 
 
+@pytest.mark.parametrize(("beside_m", "named"), [(0.003, {}), (0.015, {"masks-cut": "amber"})])
+def test_an_object_that_reaches_beyond_the_space_above_the_lid_is_told(beside_m, named):
+    masks = np.stack([ball(pose, (beside_m, 0.0, 0.0)) for pose in POSES])
+    assert findings(masks & REGIONS, regions=REGIONS) == named
+
+
 def test_masks_that_stand_still_show_the_wall():
     still = np.broadcast_to(ball(POSES[0], offset_m=-SPHERE_CENTRE_M + [0, 0, 0.1]), (FRAMES, 64, 64))
     assert findings(still, seen(still, change=0.0))["masks-static"] == "red"

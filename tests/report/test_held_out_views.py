@@ -1,6 +1,8 @@
 """Held-out views: scores, points and rendering; training curves and settings of a run."""
 
+import weakref
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -136,6 +138,27 @@ def run(flagged_dataset):
     pipeline = untrained_pipeline(flagged_dataset)
     pipeline.eval()
     return TrainedRun(pipeline.model, pipeline.datamanager)
+
+
+def test_the_cubes_of_a_view_are_freed_before_the_next_is_rendered():
+    cubes = []
+
+    def cube():
+        made = torch.rand(16, 16, 4)
+        cubes.append(weakref.ref(made))
+        return made
+
+    def batch(index):
+        assert not any(one() is not None for one in cubes)
+        return None, {"spectral": cube(), "mask": torch.ones(16, 16, 1)}
+
+    model = SimpleNamespace(rgb_bands=[2, 1, 0], get_outputs_for_camera=lambda camera: {"spectral": cube()})
+    frames = [SimpleNamespace(capture=f"ball_{number}") for number in range(3)]
+    manager = SimpleNamespace(
+        eval_dataset=SimpleNamespace(frames=frames), fixed_indices_eval_dataloader=SimpleNamespace(get_camera=batch)
+    )
+    assert len(list(render_held_out(SimpleNamespace(model=model, manager=manager), 3))) == 3
+    assert len(cubes) == 6
 
 
 @pytest.mark.slow

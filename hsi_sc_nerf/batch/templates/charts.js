@@ -28,7 +28,7 @@ function scaled(values, from, to, wanted = 6) {
 /** A mark that tells its object and opens its report. */
 function mark(data, index, path, attributes, x, y, told) {
   const point = drawn("path", { d: path, transform: `translate(${x.toFixed(1)} ${y.toFixed(1)})`, ...attributes });
-  point.append(drawn("title", {}, `${data.rows[index][data.places.object]}: ${told}`));
+  point.append(drawn("title", {}, `${nameOf(data, index)}: ${told}`));
   return data.reports[index] ? drawn("a", { href: data.reports[index], tabindex: "-1" }, point) : point;
 }
 

@@ -91,7 +91,7 @@ function drawCharts() {
   const odd = [...groups.values()].flat().filter((index) => sides.has(index));
   const links = odd.slice(0, LISTED_OUTLIERS).map((index) => element(data.reports[index] ? "a" : "span",
     data.reports[index] ? { href: data.reports[index] } : {},
-    `${data.rows[index][data.places.object]} ${sides.get(index) > 0 ? "▲" : "▼"}`));
+    `${nameOf(data, index)} ${sides.get(index) > 0 ? "▲" : "▼"}`));
   const more = odd.length > links.length ? ` and ${odd.length - links.length} more` : "";
   find(".outliers").replaceChildren(odd.length ? "Outliers: " : "No outliers.", ...links.flatMap((link) => [link, " "]), more);
   drawScatter(find("#scatter .drawing"), find(".legend"), data, [x, up], groups, [sidesOf(x), sidesOf(up)]);

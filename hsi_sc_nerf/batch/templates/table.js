@@ -17,9 +17,15 @@ function shownNumber(value, spread) {
 
 const headed = (column) => column.label + (column.unit ? `, ${column.unit}` : "");
 
+/** The object's name, and which of several on the table it is. */
+function nameOf(data, index) {
+  const row = data.rows[index], piece = row[data.places.piece];
+  return String(row[data.places.object]) + (piece ? `, piece ${piece}` : "");
+}
+
 /** The object's name and picture; a link where it has a report. */
 function objectCell(data, index) {
-  const name = String(data.rows[index][data.places.object]), cell = element("th", { scope: "row" });
+  const name = nameOf(data, index), cell = element("th", { scope: "row" });
   const link = data.reports[index] ? element("a", { href: data.reports[index] }) : element("span");
   link.className = "object";
   if (data.pictures[index]) link.append(element("img", { src: data.pictures[index], alt: "", loading: "lazy" }));

@@ -1,0 +1,80 @@
+"""Two balls on one table, from captures to traits by `hsi-sc-nerf run`: each one's volume beside the truth.
+
+uv run python benchmarks/two_balls.py --output-dir OUT
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+import tyro
+from results_table import RESULTS, write_results
+
+DIAMETERS_M, APART_M = (0.036, 0.026), 0.044
+MATERIAL = "tomato_red"
+EFFECTS = ("photon_noise", "read_noise", "dark_pattern")
+COLUMNS = ("object", "true volume, mL", "volume, mL", "volume, error", "height, error", "largest diameter, error")
+SCENE = """
+name: balls
+object: {{shape: mesh, mesh_file: balls.ply, materials: [{material}]}}
+camera: {{elevation_deg: 22, distance_m: 0.45, aim_height_m: 0.062, size_px: 128}}
+turntable: {{disc_diameter_m: 0.205, frames: 36}}
+markers: {{side_m: 0.036}}
+effects: [{effects}]
+seed: 1
+"""
+
+
+@dataclass(frozen=True)
+class TwoBalls:
+    """Simulate, run, compare, write the table."""
+
+    output_dir: Path
+    """Folder for session and results; what is there is used again."""
+    preset: str = "fast"
+    """Of the training."""
+    results: Path = RESULTS
+    """Folder of the CSV file."""
+
+    def main(self) -> None:
+        """Do what is missing, print the table, write it."""
+        out = self.output_dir
+        session, run = out / "session", out / self.preset
+        out.mkdir(parents=True, exist_ok=True)
+        if not session.is_dir():
+            balls = []
+            for diameter_m, x_m in zip(DIAMETERS_M, (-APART_M / 2.0, APART_M / 2.0), strict=True):
+                ball = trimesh.creation.icosphere(5, diameter_m / 2.0)
+                balls.append(ball.apply_translation([x_m, 0.0, diameter_m / 2.0]))
+            trimesh.util.concatenate(balls).export(out / "balls.ply")
+            text = SCENE.format(material=MATERIAL, effects=", ".join(EFFECTS))
+            (out / "balls.yaml").write_text(text, encoding="utf-8")
+            _command("simulate", str(out / "balls.yaml"), str(session))
+        words = ["--preset", self.preset, "--process=--masks.pieces 2", "--num-points", "60000"]
+        _command("run", str(session), "--output-dir", str(run), *words)
+        found = json.loads((run / "traits" / "traits.json").read_text(encoding="utf-8"))["pieces"]
+        rows = []
+        for diameter_m, one in zip(DIAMETERS_M, found, strict=True):
+            true_ml, size, sd = 1e6 * np.pi * diameter_m**3 / 6.0, one["size"], one["size_sd"]
+            errors = [size["volume_l"] * 1e3 / true_ml, *(size[f"{k}_m"] / diameter_m for k in _LENGTHS)]
+            measured = f"{1e3 * size['volume_l']:.2f} ± {1e3 * sd['volume_l']:.2f}"
+            shown = [f"{100.0 * (error - 1.0):+.1f} %" for error in errors]
+            rows.append([f"ball of {1e3 * diameter_m:.0f} mm, {self.preset}", f"{true_ml:.2f}", measured, *shown])
+        write_results("two_balls", COLUMNS, rows, keys=1, folder=self.results)
+
+
+_LENGTHS = ("height", "largest_diameter")
+
+
+def _command(*words: str) -> None:
+    subprocess.run([sys.executable, "-m", "hsi_sc_nerf.cli.main", *words], check=True)
+
+
+if __name__ == "__main__":
+    tyro.cli(TwoBalls, description=__doc__).main()

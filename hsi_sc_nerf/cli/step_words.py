@@ -1,0 +1,44 @@
+"""Words for the steps of a session, refused before the first step if their commands do not take them."""
+
+from __future__ import annotations
+
+import io
+from contextlib import redirect_stderr, redirect_stdout
+from typing import Any
+
+import tyro
+
+from hsi_sc_nerf.batch.session_steps import SessionSettings
+from hsi_sc_nerf.benchmark.configurations import split_words
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.settings_file import check_options
+
+
+def check_words(settings: SessionSettings) -> None:
+    """Check the words for our commands; those for ns-train are left to it.
+
+    Raises:
+        InputError: a command does not take its words, or a number lies outside its range.
+    """
+    from hsi_sc_nerf.cli.clouds import TraitsCommand
+    from hsi_sc_nerf.cli.light import MaterialCommand
+    from hsi_sc_nerf.cli.sessions import ProcessCommand
+
+    # What the steps give themselves: any text will do.
+    _check("process", settings.process, ProcessCommand, "session", "--output-dir", "out")
+    _check("material", settings.material, MaterialCommand, "cloud", "--load-config", "config.yml")
+    _check("traits", settings.traits, TraitsCommand, "cloud", "--output-dir", "out")
+
+
+def _check(name: str, words: str, command: Any, *given: str) -> None:
+    try:
+        with redirect_stderr(io.StringIO()), redirect_stdout(io.StringIO()):
+            read = tyro.cli(command, args=[*given, *split_words(words)])
+    except SystemExit as end:
+        raise InputError(
+            f"--{name}: the step '{name}' cannot be called with {words}; see `hsi-sc-nerf {name} --help`."
+        ) from end
+    try:
+        check_options(read.config if name == "process" else read)
+    except InputError as error:
+        raise InputError(f"--{name}: {error}") from error

@@ -1,0 +1,48 @@
+"""The packed dataset that a run was trained on, looked for in a moment: to open a run takes many seconds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import yaml
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.packed.dataset import transforms_path
+
+_KEYS = ("pipeline", "datamanager", "data")
+
+
+def require_dataset_of_run(load_config: Path) -> None:
+    """Look for the dataset where `hsi_sc_nerf.models.trained_run.open_run` will.
+
+    A ``config.yml`` that is missing or that tells of no dataset is left to that.
+
+    Raises:
+        InputError: the dataset is not there.
+    """
+    named = _named_dataset(load_config)
+    if named is None:
+        return
+    # A relative path is that of the folder in which the training was started.
+    places = [named, *(folder / named for folder in load_config.resolve().parents)]
+    if not any(transforms_path(place).is_file() for place in places):
+        raise InputError(
+            f"{load_config}: was trained on the packed dataset {named}, which is not there; put it back, or call the "
+            "command in the folder that the training was started in."
+        )
+
+
+def _named_dataset(load_config: Path) -> Path | None:
+    try:
+        # Nodes alone: nothing that the file names is made or called.
+        node = yaml.compose(load_config.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError):
+        return None
+    for key in _KEYS:
+        if not isinstance(node, yaml.MappingNode):
+            return None
+        node = next((value for name, value in node.value if name.value == key), None)
+    if not isinstance(node, yaml.SequenceNode) or not node.value:
+        return None
+    parts = [part.value for part in node.value]
+    return Path(*parts) if all(isinstance(part, str) for part in parts) else None

@@ -1,0 +1,80 @@
+"""Nonsense in an option is refused when it is read, in any command."""
+
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Literal, get_args, get_origin, get_type_hints
+
+import pytest
+
+from hsi_sc_nerf.batch.session_steps import SessionSettings
+from hsi_sc_nerf.cli.change import ChangeCommand
+from hsi_sc_nerf.cli.main import COMMANDS, _imported
+from hsi_sc_nerf.cli.step_words import check_words
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.evaluation.comparison import CompareConfig
+from hsi_sc_nerf.processing.masks import MaskConfig
+from hsi_sc_nerf.processing.process import ProcessConfig, process_session
+from hsi_sc_nerf.settings_file import check_options
+
+CHECKED_ELSEWHERE = {
+    *(f"simulate {name}" for name in ("frames", "size", "bands", "seed")),  # with those of the scene
+    "traits roi",  # has a name among its numbers
+    "benchmark checkpoints",  # above 0
+}
+
+
+def numbers_of(cls, prefix):
+    """Name, and whether it has a range, of each option that is a number or several."""
+    hints = get_type_hints(cls)
+    for one in fields(cls):
+        if is_dataclass(hints[one.name]):
+            yield from numbers_of(hints[one.name], f"{prefix}{one.name}.")
+        elif is_number(hints[one.name]):
+            yield prefix + one.name, "range" in one.metadata
+
+
+def is_number(hint):
+    return hint in (int, float) or (get_origin(hint) is not Literal and any(map(is_number, get_args(hint))))
+
+
+@pytest.mark.slow
+def test_every_option_that_is_a_number_has_a_range():
+    found = {name: ranged for command in COMMANDS for name, ranged in numbers_of(_imported(command), f"{command} ")}
+    assert {name for name, ranged in found.items() if not ranged} == CHECKED_ELSEWHERE
+    assert len(found) > 40
+
+
+@pytest.mark.parametrize(
+    ("config", "told"),
+    [
+        (ProcessConfig(masks=MaskConfig(pieces=0)), r"--masks\.pieces is 0; it must lie between 1 and 1000\."),
+        (ProcessConfig(masks=MaskConfig(overhang=float("nan"))), r"--masks\.overhang is nan"),
+        (ChangeCommand((Path("a"), Path("b")), Path("out"), piece=(1, 0)), "--piece is 0"),
+        (ProcessConfig(workers=0), "--workers is 0"),
+        (CompareConfig(points=0), r"--points is 0; it must be at least 100\."),
+    ],
+)
+def test_nonsense_is_one_sentence(config, told):
+    with pytest.raises(InputError, match=told):
+        check_options(config)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        (SessionSettings(process="--masks.pieces 0"), r"--process: --masks\.pieces is 0; it must lie"),
+        (SessionSettings(traits="--idx PRI"), "--traits: the step 'traits' cannot be called with --idx PRI"),
+        (SessionSettings(material="--white-azimuth-deg nan"), "--material: --white-azimuth-deg is nan"),
+    ],
+)
+def test_words_for_a_step_are_refused_before_the_first(settings, told):
+    check_words(SessionSettings(process="--masks.pieces 2", traits="--index PRI --roi a 0 0 0 0.01"))
+    with pytest.raises(InputError, match=told):
+        check_words(settings)
+
+
+def test_process_refuses_it_before_it_looks_at_the_session(tmp_path):
+    with pytest.raises(InputError, match=r"--masks\.pieces is 0"):
+        process_session(tmp_path / "none", tmp_path / "out", ProcessConfig(masks=MaskConfig(pieces=0)))
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,33 @@
+"""Commands look for a run's dataset before they load what takes seconds."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.packed.of_run import require_dataset_of_run
+
+
+@pytest.fixture
+def config(tmp_path):
+    path = tmp_path / "outputs" / "pear" / "config.yml"
+    path.parent.mkdir(parents=True)
+    data = Path("pear-data")
+    path.write_text(yaml.dump({"data": data, "pipeline": {"datamanager": {"data": data}}}))
+    return path
+
+
+def test_a_dataset_is_looked_for_from_the_runs_folder_upwards(config, tmp_path):
+    with pytest.raises(InputError, match=r"config\.yml: was trained on the packed dataset pear-data, which is not"):
+        require_dataset_of_run(config)
+    (tmp_path / "pear-data").mkdir()
+    (tmp_path / "pear-data" / "transforms.json").write_text("{}")
+    require_dataset_of_run(config)
+
+
+@pytest.mark.parametrize("text", ["", "[]", "pipeline: 3", "pipeline: {datamanager: {data: null}}", "a: [", "\x00"])
+def test_what_tells_of_no_dataset_is_left_to_others(config, text):
+    config.write_text(text)
+    require_dataset_of_run(config)
+    require_dataset_of_run(config.with_name("none.yml"))
