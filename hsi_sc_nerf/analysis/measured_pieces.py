@@ -57,8 +57,10 @@ def measure_pieces(
     config = on_container(MeshConfig() if mesh is None else mesh, dataset)
     pieces = standing_pieces(cloud.points, config)
     if len(pieces) == 1 or piece is not None:
-        given = {"regions": regions, "drawn_regions": drawn_regions, "piece": piece}
-        return [measure_traits(cloud, dataset, mesh=config, **given, **settings)]
+        alone = measure_traits(
+            cloud, dataset, mesh=config, regions=regions, drawn_regions=drawn_regions, piece=piece, **settings
+        )
+        return [alone]
     trees = [cKDTree(cloud.points[rows]) for rows in pieces]
 
     def hold(number: int, points_m: Float[np.ndarray, "n 3"]) -> bool:
