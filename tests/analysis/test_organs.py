@@ -165,7 +165,7 @@ def test_a_stub_is_a_stem_and_not_a_calyx():
 def test_no_organ_is_invented(shape, coloured):
     """Not of noise, of colour that fades, of a blush, of shade, nor of the mixed pixels where it stands."""
     rng = np.random.default_rng(1)
-    points_m = ball(8000, rng) if shape == "ball" else rod(0.16, 0.02, 8000, rng)
+    points_m = ball(4000, rng) if shape == "ball" else rod(0.16, 0.02, 4000, rng)
     height = (points_m[:, 2] - points_m[:, 2].min()) / np.ptp(points_m[:, 2])
     # Pixels at the lower edge are mixed with what the object stands on, the more the lower they lie.
     rim = np.clip(0.7 - height / 0.06, 0.0, 1.0)
