@@ -7,8 +7,10 @@ import sys
 from functools import partial
 from pathlib import Path
 
+import accuracy_and_time
 import numpy as np
 import pytest
+from accuracy_and_time import AccuracyAndTime
 from beyond_the_paper import reflectance_of
 from capture_factory import INFO, frame_reflectance, true_poses, write_session
 from damaged_files import damaged, run_kind
@@ -142,6 +144,30 @@ def test_a_frame_without_a_pose_has_noise_free_reflectance(tmp_path):
     reflectance, valid = reflectance_of(data, "ball_2")
     np.testing.assert_allclose(reflectance[valid], frame_reflectance(90.0)[valid], atol=0.01)
     assert valid.all()
+
+
+def test_rows_are_trained_for_the_steps_that_their_time_buys(tmp_path, monkeypatch):
+    """Seconds of a step that an earlier part measured are kept; those of a slower hour are scaled to them."""
+    seconds, datasets = {"default": 0.1, "25 bands": 0.08, "64 x 64 pixels": 0.09}, []
+
+    def measured(runs, common):
+        datasets.append({name: data for name, (data, _) in runs.items()})
+        return {name: len(datasets) * seconds[name] for name in runs}
+
+    monkeypatch.setattr(accuracy_and_time, "step_seconds", measured)
+    monkeypatch.setattr(AccuracyAndTime, "_sessions", lambda self: (f"{self.size} {self.bands} {self.binning}", None))
+    for names in (("25 bands",), ("default", "25 bands", "64 x 64 pixels")):
+        command = AccuracyAndTime(output_dir=tmp_path, names=names, default_step_seconds=0.05)
+        rows = command._rows("pictures", command._step_seconds("pictures"))
+    assert {name: row.iterations for name, row, _ in rows} == {
+        "default": 800,
+        "25 bands": 1000,
+        "64 x 64 pixels": 889,
+    }
+    assert datasets == [
+        {"default": "128 204 1", "25 bands": "128 25 8"},
+        {"default": "128 204 1", "64 x 64 pixels": "64 204 1"},
+    ]
 
 
 STAND_INS = Path(__file__).parents[1] / "benchmarks" / "gpu_stand_ins"
