@@ -313,15 +313,21 @@ def _onnx_model(table: Path, name: str, bands: int, columns: slice) -> Callable[
         session = onnxruntime.InferenceSession(
             str(path), options, providers=["CPUExecutionProvider"], enable_fallback=0
         )
-        takes, gives = session.get_inputs()[0], session.get_outputs()[-1].name
+        takes, last = session.get_inputs()[0], session.get_outputs()[-1]
+        if last.type.startswith("seq"):
+            raise InputError(
+                f"{path}: gives dictionaries of classes, not columns; export it with options={{'zipmap': False}}."
+            )
         kind = {"tensor(float)": np.float32, "tensor(double)": np.float64}[takes.type]
 
         def predict(spectra: np.ndarray) -> np.ndarray:
-            (found,) = session.run([gives], {takes.name: spectra.astype(kind)})
+            (found,) = session.run([last.name], {takes.name: spectra.astype(kind)})
             return np.asarray(found, float).reshape(len(spectra), -1)[:, columns]
 
         if (given := predict(np.zeros((2, bands))).shape[1]) != expected:
             raise ValueError(f"it gives {given} of {expected}")
+    except InputError:
+        raise
     except Exception as error:  # onnxruntime's exceptions have no common class
         raise InputError(
             f"{path}: is no ONNX model of spectra of {bands} bands whose last output has {expected} columns from "

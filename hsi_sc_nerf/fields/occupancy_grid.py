@@ -28,9 +28,9 @@ MISSED_FRACTION = 0.2
 """Frames whose masks may miss a point that may hold matter. A stem of one pixel is missed in a tenth of the masks; a
 looser bound costs samples, a tighter one the stem."""
 REFRESH_EVERY, REFRESH_PARTS = 8, 4
-"""After so many steps, the field's density is asked for in one of so many parts of the cells."""
+"""After so many steps, the field's density is evaluated in one of so many parts of the cells."""
 FULL_REFRESHES = 4
-"""A new field is asked so often in each cell, by when the average has forgotten what it began with."""
+"""A new field is evaluated so often in each cell, by when the average has forgotten what it began with."""
 LEARNED = 0.5
 """Weight of a new opacity of a cell, in a moving average: a cell is as opaque as its points are on average, so that
 one dense point does not hide what lies behind the cell."""

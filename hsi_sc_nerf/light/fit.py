@@ -152,7 +152,7 @@ class _Fit:
             setattr(self, name, value)
 
     def converge(self, *, estimate_unevenness: bool = False) -> None:
-        """Gauss-Newton with the present lamps; the chamber's unevenness is estimated as well if asked for."""
+        """Gauss-Newton with the present lamps; the chamber's unevenness is estimated as well on request."""
         for number in range(STEPS):
             self._bounce()
             residual, jacobian = self._linearised()

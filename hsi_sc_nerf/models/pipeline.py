@@ -122,7 +122,7 @@ class _JudgedViews:
                 yield camera, batch
 
     def left_out(self) -> str:
-        """What to say of the views that were left out, once all were asked for."""
+        """What to say of the views that were left out, once all were to be rendered."""
         if self.judged == self._seen:
             return ""
         which = "none" if self.judged == 0 else f"{self.judged}"

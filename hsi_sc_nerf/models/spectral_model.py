@@ -65,7 +65,7 @@ class SpectralModelConfig(NerfactoModelConfig):
     """What is simulated, joined by commas: view_dependence (a point's spectrum depends on how it is turned to the
     camera and the lamps, which stand still), still_chamber (the background is a picture of the chamber, taken
     from the frames, instead of its median spectrum), pose_refinement (training moves the poses). none: nothing of it.
-    auto: what the dataset calls for (docs/validation/effects.md)."""
+    auto: what the dataset shows (docs/validation/effects.md)."""
     background: Literal["chamber", "last-sample"] = "chamber"
     """Spectrum of the light that the object lets through. chamber: the chamber's. last-sample: that of the last
     sample of the ray, as in nerfacto."""

@@ -129,6 +129,15 @@ def test_a_calibration_beyond_the_bands_is_refused(fitted):
         calibration_map(surface_of(spectra[:, :51], NM[:51]), read_calibration(fitted))
 
 
+def test_a_classifier_that_gives_dictionaries_is_refused_with_the_way_to_export_it(tmp_path):
+    """As skl2onnx writes it by default."""
+    pytest.importorskip("onnxruntime")
+    (tmp_path / "zipmap.onnx").write_bytes((MODELS / "zipmap.onnx").read_bytes())
+    head = {"model": "zipmap.onnx", "classes": "sound, bruised"}
+    with pytest.raises(InputError, match=r"zipmap.onnx: gives dictionaries .*'zipmap': False"):
+        read_calibration(table(tmp_path / "own.csv", head, {"wavelength_nm": NM[:6]}))
+
+
 @pytest.mark.parametrize(("model", "column", "rtol"), [("pls.onnx", 6, 1e-5), ("classes.onnx", 7, 1e-5)])
 def test_models_of_scikit_learn_as_onnx(tmp_path, capfd, model, column, rtol):
     pytest.importorskip("onnxruntime")

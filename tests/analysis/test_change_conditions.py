@@ -2,7 +2,10 @@
 
 import numpy as np
 
-from hsi_sc_nerf.analysis.change_conditions import rareness, steepest_rise
+from hsi_sc_nerf.analysis.change_conditions import patch_conditions, rareness, steepest_rise
+from hsi_sc_nerf.analysis.change_days import Day
+from hsi_sc_nerf.analysis.change_significance import surface_patches
+from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.simulate.mesh import sphere
 
 
@@ -45,3 +48,26 @@ def test_of_many_patches_some_stand_for_all():
     spectra = np.random.default_rng(1).random((4000, 6))
     some = np.random.default_rng(2).permutation(4000)[:1000]
     np.testing.assert_allclose(rareness(spectra)[some], rareness(spectra[some]), rtol=0.15)
+
+
+def test_a_spot_is_rare_if_it_was_there_on_both_days_and_the_worst_day_counts():
+    mesh = sphere(0.06)
+    vertices, skin, bruise = mesh.vertices, np.array([0.2, 0.4, 0.7]), np.array([0.3, 0.3, 0.3])
+    old, new = (np.linalg.norm(vertices - vertices[(vertices @ at).argmax()], axis=1) < 0.008 for at in np.eye(3)[:2])
+
+    def day(spots, steep):
+        spectra = np.where(spots[:, None], bruise, skin)
+        surface = SpectralMesh(mesh, spectra, np.array([500.0, 600.0, 700.0]), np.ones(len(vertices), bool))
+        return Day("day", surface, np.zeros(len(vertices)), np.full((len(vertices), 3), steep), None)
+
+    days = day(old, 1.0), day(old | new, 3.0)
+    patches = surface_patches(vertices, days[0].surface.areas_m2, np.ones(len(vertices), bool))
+    to_rim_m = np.arange(len(patches.areas_m2)) / 1e3
+    found = patch_conditions(*days, (day(old, 2.0),), patches, to_rim_m)
+    np.testing.assert_allclose(found[:, :3], 3.0)
+    np.testing.assert_allclose(found[:, 3], -to_rim_m)
+    assert (found[:, 4] < 0.0).all()  # a ball rises nowhere
+    inside = [patches.means(spot[:, None].astype(float), days[0].surface.areas_m2)[:, 0] > 0.9 for spot in (old, new)]
+    assert all(one.any() for one in inside)
+    assert found[inside[0], 5].min() > 0.2
+    np.testing.assert_allclose(found[inside[1], 5], 0.0, atol=1e-6)

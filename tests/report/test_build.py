@@ -402,6 +402,10 @@ def test_the_scale_bar_is_as_long_as_it_says_and_the_page_has_its_own_colours(br
         of_canvas = bar.bounding_box()["width"] / canvas.bounding_box()["height"]
         # The ball, 30 mm in radius, has its largest side 60 mm as 2; the camera stands at 4.1 with 0.6 rad of view.
         assert mm == pytest.approx(of_canvas * 2.0 * 4.1 * np.tan(0.3) * 30.0, rel=0.02)
+        # A printer lays the page out on a narrower sheet, and does not draw the object anew.
+        paper = page.add_style_tag(content=".stage { width: 300px; }")
+        assert bar.bounding_box()["width"] / canvas.bounding_box()["height"] == pytest.approx(of_canvas, rel=0.01)
+        paper.evaluate("tag => tag.remove()")
         canvas.focus()
         for _ in range(12):
             page.keyboard.press("+")
@@ -430,7 +434,7 @@ def test_the_picture_is_saved_as_it_is_drawn(browser, report):
         assert picture.shape[1:] == (width, 4)
         ends = picture[height + 15, [13, -14]]
         np.testing.assert_allclose(ends, [[68, 1, 84, 255], [253, 231, 37, 255]], atol=2)
-        length = page.locator(".scale").evaluate("scale => parseFloat(scale.style.width)")
+        length = page.locator(".scale").evaluate("scale => scale.getBoundingClientRect().width")
         assert (picture[height - 14] == [0, 0, 0, 255]).all(axis=1).sum() == pytest.approx(length, abs=2.0)
         np.testing.assert_allclose(picture[height // 4, width // 2], [253, 231, 37, 255], atol=12)
         assert picture[2, 2, 3] == 0

@@ -187,7 +187,8 @@ function start(root, cloud) {
   function drawScale() {
     const mm = renderer.pixels() / (cloud.reach * 1e3), longest = (0.3 * canvas.clientWidth) / mm;
     const power = 10 ** Math.floor(Math.log10(longest)), length = [5, 2, 1].find((n) => n * power <= longest) * power;
-    scale.style.width = `${length * mm}px`;
+    // A part of the picture's width, so that it stays right where the page is printed on a narrower sheet.
+    scale.style.width = `${(100 * length * mm) / canvas.clientWidth}%`;
     scale.textContent = `${Number(length.toPrecision(1))} mm`;
   }
 

@@ -38,7 +38,7 @@ function pictureOf(canvas, scale, legend, colours) {
     context.fillText(text, x, y);
   }
 
-  const length = parseFloat(scale.style.width);
+  const length = scale.getBoundingClientRect().width;
   context.strokeRect(margin, high - margin - 3, length, 3);
   context.fillRect(margin, high - margin - 3, length, 3);
   write(scale.textContent, margin + length / 2, high - margin - 8, "center");

@@ -17,6 +17,7 @@ pls = PLSRegression(3).fit(spectra, values)
 classes = LogisticRegression().fit(spectra, (values > np.median(values)).astype(int))
 (folder / "pls.onnx").write_bytes(to_onnx(pls, spectra[:1]).SerializeToString())
 (folder / "classes.onnx").write_bytes(to_onnx(classes, spectra[:1], options={"zipmap": False}).SerializeToString())
+(folder / "zipmap.onnx").write_bytes(to_onnx(classes, spectra[:1]).SerializeToString())
 some = spectra[:5]
 table = np.column_stack([some, pls.predict(some).ravel(), classes.predict_proba(some)[:, 1]])
 title = "six bands, then what PLSRegression and LogisticRegression give"
