@@ -40,7 +40,7 @@ from hsi_sc_nerf.simulate.session import simulate_session
 
 KILLED = [
     "command",
-    "undisturbed, processor s",
+    "undisturbed, s",
     "moments",
     "runs to the end",
     "half-written files",
@@ -298,7 +298,7 @@ def main(
                     counts = killed(command, folder, inputs / command.name, expected)
                 else:
                     counts = pressed(command, folder, inputs / command.name, expected)
-                known = {"command": command.name, "undisturbed, processor s": f"{seconds:.1f}", "moments": count}
+                known = {"command": command.name, "undisturbed, s": f"{seconds:.1f}", "moments": count}
                 row = [str(known.get(column, counts[column])) for column in columns]
                 write_results(name, columns, [row], keys=1, seed=str(seed), folder=results)
 
