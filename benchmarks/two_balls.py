@@ -56,16 +56,18 @@ class TwoBalls:
             text = SCENE.format(material=MATERIAL, effects=", ".join(EFFECTS))
             (out / "balls.yaml").write_text(text, encoding="utf-8")
             _command("simulate", str(out / "balls.yaml"), str(session))
-        words = ["--preset", self.preset, "--process=--masks.pieces 2", "--num-points", "60000"]
-        _command("run", str(session), "--output-dir", str(run), *words)
-        found = json.loads((run / "traits" / "traits.json").read_text(encoding="utf-8"))["pieces"]
+        traits = run / "traits" / "traits.json"
+        if not traits.is_file():
+            words = ["--preset", self.preset, "--process=--masks.pieces 2", "--num-points", "60000"]
+            _command("run", str(session), "--output-dir", str(run), *words, "--traits=--splits 0")
+        found = json.loads(traits.read_text(encoding="utf-8"))["pieces"]
         rows = []
         for diameter_m, one in zip(DIAMETERS_M, found, strict=True):
-            true_ml, size, sd = 1e6 * np.pi * diameter_m**3 / 6.0, one["size"], one["size_sd"]
-            errors = [size["volume_l"] * 1e3 / true_ml, *(size[f"{k}_m"] / diameter_m for k in _LENGTHS)]
-            measured = f"{1e3 * size['volume_l']:.2f} ± {1e3 * sd['volume_l']:.2f}"
-            shown = [f"{100.0 * (error - 1.0):+.1f} %" for error in errors]
-            rows.append([f"ball of {1e3 * diameter_m:.0f} mm, {self.preset}", f"{true_ml:.2f}", measured, *shown])
+            true_ml, size = 1e6 * np.pi * diameter_m**3 / 6.0, one["size"]
+            ratios = [1e3 * size["volume_l"] / true_ml, *(size[f"{k}_m"] / diameter_m for k in _LENGTHS)]
+            errors = [f"{100.0 * (ratio - 1.0):+.1f} %" for ratio in ratios]
+            name = f"ball of {1e3 * diameter_m:.0f} mm, {self.preset}"
+            rows.append([name, f"{true_ml:.2f}", f"{1e3 * size['volume_l']:.2f}", *errors])
         write_results("two_balls", COLUMNS, rows, keys=1, folder=self.results)
 
 

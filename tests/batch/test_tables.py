@@ -8,6 +8,7 @@ from batch_folder import traits_of, write_object, write_season, write_sessions
 
 from hsi_sc_nerf.batch import columns
 from hsi_sc_nerf.batch.columns import STANDING, class_columns, region_columns
+from hsi_sc_nerf.batch.page import write_overview
 from hsi_sc_nerf.batch.tables import named_apart, read_table, write_tables
 from hsi_sc_nerf.cli.batch import CollectCommand
 from hsi_sc_nerf.errors import InputError
@@ -136,3 +137,17 @@ def test_without_pyarrow_the_rest_is_written_and_said(tmp_path, monkeypatch, cap
         *("sessions.csv", "objects", "traits.csv", "traits_dictionary.csv", "index.html")
     }
     assert "pip install 'hsi-sc-nerf[batch]'" in capsys.readouterr().out
+
+
+def test_objects_on_one_table_have_rows_and_names_of_their_own(tmp_path):
+    write_sessions(tmp_path, [("berries", "captures/1", "A", "0"), ("pear", "captures/2", "B", "0")])
+    pieces = [{"piece": number, "centre_m": [0.02, 0.0, 0.1], **traits_of(300.0 / number)} for number in (1, 2)]
+    write_object(tmp_path / "objects" / "berries", {"pieces": pieces})
+    write_object(tmp_path / "objects" / "pear")
+    table = read_table(tmp_path)
+    names = [column.name for column in table.columns]
+    keys = [(row[names.index("object")], row[names.index("piece")]) for row in table.rows]
+    assert keys == [("berries", 1.0), ("berries", 2.0), ("pear", None)]
+    page = write_overview(table, tmp_path).read_text(encoding="utf-8")
+    assert f'"piece": {names.index("piece")}' in page
+    assert "3 objects" in page
