@@ -159,7 +159,7 @@ def trait_tables(content: Mapping[str, Any]) -> list[TraitTable]:
     tables = [TraitTable("Size", note, ["trait", "value", "unit"], rows)]
     if content["classes"]:
         tables += _class_tables(content["classes"], seen_m2)
-    tables.append(_reflectance_table({name: region["reflectance"] for name, region in content["regions"].items()}))
+    tables.append(_reflectance_table(content["regions"]))
     regions = {name: region["indices"] for name, region in content["regions"].items()}
     names = list(regions[WHOLE])
     if names:
@@ -229,9 +229,10 @@ def _listed(causes: Iterable[str]) -> str:
     return f"{', '.join(rest)} and {last}" if rest else last
 
 
-def _reflectance_table(regions: Mapping[str, Mapping[str, float | None]]) -> TraitTable:
-    """Brightness of each region with its uncertainty, and the light on it where it is known."""
-    header = ["region", "reflectance"]
+def _reflectance_table(content: Mapping[str, Mapping[str, Any]]) -> TraitTable:
+    """Area and brightness of each region with its uncertainty, and the light on it where it is known."""
+    regions = {name: region["reflectance"] for name, region in content.items()}
+    header = ["region", "seen area, cm²", "reflectance"]
     note = "Mean over the bands; ± is its standard deviation"
     told = all(value["std"] is not None for value in regions.values())
     note += "." if told else ", which is left out where the dataset (--data) or the number of views is not known."
@@ -244,7 +245,7 @@ def _reflectance_table(regions: Mapping[str, Mapping[str, float | None]]) -> Tra
         )
     rows = []
     for name, value in regions.items():
-        row = [name, _with_sd(value["mean"], value["std"])]
+        row = [name, f"{_CM2_PER_M2 * content[name]['area_m2']:.2f}", _with_sd(value["mean"], value["std"])]
         if lit:
             row += [f"{value['measured']:.3f}", _with_sd(value["irradiance"], value["irradiance_std"])]
         rows.append(row)

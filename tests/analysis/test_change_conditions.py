@@ -27,7 +27,7 @@ def test_a_surface_rises_by_the_angle_to_the_tip_of_what_stands_on_it():
 def test_a_ball_falls_off_on_all_sides_and_inside_of_it_its_wall_rises():
     ball_m = sphere(0.06).vertices - [0.0, 0.0, 0.03]
     some_m = ball_m[::97]
-    outside, inside = (steepest_rise(some_m, side * some_m, ball_m) for side in (1.0, -1.0))
+    outside, inside = (steepest_rise(some_m, side * some_m, ball_m[::7]) for side in (1.0, -1.0))
     assert (outside < 0.0).all()
     np.testing.assert_allclose(inside, 0.025 / 0.06, atol=0.02)  # a chord rises by its length over the diameter
 

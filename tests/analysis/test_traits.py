@@ -320,7 +320,7 @@ def test_sizes_have_the_decimals_of_their_uncertainty(height_m, sd_m, shown):
         "seen_area_m2": 0.01,
         "watertight": True,
         "classes": None,
-        "regions": {WHOLE: {"indices": {}, "reflectance": {"mean": 0.4, "std": None}}},
+        "regions": {WHOLE: {"area_m2": 0.01, "indices": {}, "reflectance": {"mean": 0.4, "std": None}}},
     }
     sizes, _ = trait_tables(content)
     assert ["height", shown, "mm"] in sizes.rows
@@ -338,7 +338,11 @@ def test_the_light_of_a_region_stands_beside_its_brightness(std, shown):
         "seen_area_m2": 0.01,
         "watertight": True,
         "classes": None,
-        "regions": {name: {"indices": {}, "reflectance": of_spot} for name in (WHOLE, "spot")},
+        "regions": {
+            name: {"area_m2": area_m2, "indices": {}, "reflectance": of_spot}
+            for name, area_m2 in ((WHOLE, 0.01), ("spot", 0.00071))
+        },
     }
     _, brightness = trait_tables(content)
-    assert brightness.rows == [[name, "0.3770 ± 0.0040", "0.200", shown] for name in (WHOLE, "spot")]
+    areas = {WHOLE: "100.00", "spot": "7.10"}
+    assert brightness.rows == [[name, area, "0.3770 ± 0.0040", "0.200", shown] for name, area in areas.items()]
