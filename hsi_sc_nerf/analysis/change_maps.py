@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from hsi_sc_nerf.analysis.change_conditions import patch_conditions
 from hsi_sc_nerf.analysis.change_days import Day
 from hsi_sc_nerf.analysis.change_features import COMPONENTS, surface_gradients, unit_spectra
 from hsi_sc_nerf.analysis.change_regions import OUTSIDE, ChangedRegion, changed_regions
@@ -105,7 +104,8 @@ def changes(
     misplaced_m = _misplaced_m(before, after, one.mesh.vertices)
     hidden = one.mesh.vertices[~np.all([day.surface.seen for day in days], axis=0)]
     to_rim_m = cKDTree(hidden).query(patches.centres_m)[0] if len(hidden) else np.full(len(patches.areas_m2), np.inf)
-    conditions = patch_conditions(before, after, tuple(days[2:]), patches, to_rim_m)
+    worst = patches.means(np.max([day.conditions for day in days], axis=0), one.areas_m2)
+    conditions = np.column_stack([worst, -to_rim_m])
     modes = session_sd * np.stack([np.ones(len(one.wavelengths_nm)), np.linspace(-1.0, 1.0, len(one.wavelengths_nm))])
     typical = np.median(one.spectra[seen], axis=0)[None]
     usual, *moved = (
