@@ -32,7 +32,7 @@ from hsi_sc_nerf.indices.catalogue import CATALOGUE
 from hsi_sc_nerf.terminal import markdown_table
 
 MADE_FROM = {
-    "hsi_sc_nerf/cli/commands.py": "reference/commands.md",
+    "hsi_sc_nerf/cli/main.py": "reference/commands.md",
     "hsi_sc_nerf/config.py": "reference/settings.md",
     "hsi_sc_nerf/indices/catalogue.py": "reference/indices.md",
 }

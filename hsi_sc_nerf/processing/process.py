@@ -281,8 +281,21 @@ def _write_masks(
     brightness = np.stack([image.mean(axis=0, dtype=np.float32) for image in bins])
     lid_z_m = None if container is None else container.height_m
     names = [frame.capture for frame in frames]
-    hull = voted_hull(masks, camera_to_worlds, lens, lid_z_m)
-    findings = check_masks(masks, names, hull.silhouettes, brightness, left_out, regions, lid_middles)
+
+    def hull_of(masks: Bool[np.ndarray, "frames h w"]) -> VotedHull:
+        return voted_hull(masks, camera_to_worlds, lens, lid_z_m)
+
+    hull = hull_of(masks)
+    findings = check_masks(
+        masks,
+        names,
+        hull.silhouettes,
+        brightness,
+        left_out,
+        lambda others: hull_of(others).silhouettes,
+        regions,
+        lid_middles,
+    )
     if all(finding.level != "red" for finding in findings):
         masks = hull.trim(masks)
     for frame, mask in zip(frames, masks, strict=True):

@@ -50,8 +50,6 @@ def test_pieces_of_an_object_are_masked_together_and_others_are_told():
     both, left_out = foreground_masks(bins, MaskConfig(pieces=2))
     assert not left_out.any()
     np.testing.assert_array_equal(both, coloured)
-    with pytest.raises(InputError, match=r"--masks\.pieces is 0"):
-        foreground_masks(bins, MaskConfig(pieces=0))
 
 
 def test_no_contrast():
