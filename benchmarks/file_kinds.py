@@ -40,7 +40,7 @@ def kinds(folder: Path) -> list[Kind]:
     from hsi_sc_nerf.analysis.library import read_library
     from hsi_sc_nerf.analysis.size import scale_uncertainty
     from hsi_sc_nerf.api.clouds import read_cloud
-    from hsi_sc_nerf.batch.objects import read_object
+    from hsi_sc_nerf.batch.objects import read_objects
     from hsi_sc_nerf.batch.plan import outdated, read_plan
     from hsi_sc_nerf.batch.session_steps import SessionSettings, is_up_to_date, session_steps
     from hsi_sc_nerf.batch.tables import read_table
@@ -87,7 +87,7 @@ def kinds(folder: Path) -> list[Kind]:
 
     def every_object() -> None:
         outdated(read_plan(files["season"]), retry=True)
-        read_object(pear)
+        read_objects(pear)
         read_table(files["season"])
 
     def every_truth() -> None:

@@ -86,7 +86,8 @@ def test_what_goes_on_after_ctrl_c_is_told_by_its_processor_time(script, swallow
     process = python(script, tmp_path)
     while not (tmp_path / "ready").exists():
         assert process.poll() is None
-    assert goes_on_after_ctrl_c(process, ends_s=0.1) == swallows
+    # To end takes a tenth of a second of processor time, and more where the interpreter is new.
+    assert goes_on_after_ctrl_c(process, ends_s=1.0) == swallows
     assert process.returncode is not None
 
 

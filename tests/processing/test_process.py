@@ -334,11 +334,14 @@ def test_another_dataset_is_not_overwritten(session, tmp_path):
 
 
 @pytest.mark.slow
-def test_wrong_masks_are_refused_after_their_picture_is_drawn(session, tmp_path):
-    everything = MaskConfig(threshold=-1.0)
+def test_wrong_masks_are_refused_after_their_picture_is_drawn(session, tmp_path, monkeypatch):
+    def everything_above_the_lid(bins, config, regions):
+        return regions.copy(), np.zeros(len(regions), bool)
+
+    monkeypatch.setattr(process, "foreground_masks", everything_above_the_lid)
     with pytest.raises(InputError, match="--accept masks-border"):
-        run(session, tmp_path / "data", ProcessConfig(masks=everything))
+        run(session, tmp_path / "data")
     assert (tmp_path / "data" / "report" / "masks.png").is_file()
     assert not (tmp_path / "data" / "transforms.json").exists()
-    accepted = ProcessConfig(masks=everything, accept=("masks-border", "masks-cut", "masks-static", "masks-hull"))
+    accepted = ProcessConfig(accept=("masks-border", "masks-cut", "masks-static", "masks-hull"))
     assert open_packed(run(session, tmp_path / "data", accepted)).frames[0].mask().mean() > 0.1
