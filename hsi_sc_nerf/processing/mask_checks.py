@@ -11,6 +11,7 @@ from scipy.ndimage import binary_erosion
 from scipy.stats import median_abs_deviation
 
 from hsi_sc_nerf.findings import Finding, Level, leave_out, names_in_short
+from hsi_sc_nerf.processing.visual_hull import VotedHull
 from hsi_sc_nerf.robust_scatter import robust_std
 
 MAX_EMPTY_FRACTION = 0.05
@@ -44,7 +45,7 @@ STANDING_FRACTION = 0.5
 def check_masks(
     masks: Bool[np.ndarray, "frames h w"],
     names: Sequence[str],
-    silhouettes: Bool[np.ndarray, "frames h w"],
+    hull: VotedHull,
     brightness: Float[np.ndarray, "frames h w"],
     left_out: Bool[np.ndarray, "frames"],
     silhouettes_of: Callable[[Bool[np.ndarray, "frames h w"]], Bool[np.ndarray, "frames h w"]],
@@ -54,14 +55,14 @@ def check_masks(
     """Findings on the masks; none for good ones.
 
     Args:
-        silhouettes: of the masks' visual hull (`VotedHull`).
+        hull: of the masks.
         left_out: frames with a piece that its mask leaves out (`masks.foreground_masks`).
         silhouettes_of: gives those of the visual hull of other masks.
         regions: pixels that may be the object's (`masks.above_lid`), if the container is known.
         lid_middles: pixels that see the middle of the lid (`masks.lid_middle`), if the container is known.
 
     Example:
-        >>> found = check_masks(masks, names, hull.silhouettes, brightness, left_out, silhouettes_of)
+        >>> found = check_masks(masks, names, hull, brightness, left_out, silhouettes_of)
         >>> refuse_red(found, accepted=["masks-border"])
     """
     empty = np.logical_not(masks.any(axis=(1, 2)))
@@ -87,7 +88,7 @@ def check_masks(
         *found,
         *_border(masks[~empty], None if regions is None else regions[~empty]),
         *_still(masks[~empty], brightness, None if lid_middles is None else lid_middles[~empty]),
-        *_hull(masks, names, silhouettes, brightness, silhouettes_of),
+        *_hull(masks, names, hull, brightness, silhouettes_of),
     ]
 
 
@@ -158,15 +159,15 @@ def _still(
 def _hull(
     masks: Bool[np.ndarray, "frames h w"],
     names: Sequence[str],
-    silhouettes: Bool[np.ndarray, "frames h w"],
+    hull: VotedHull,
     brightness: Float[np.ndarray, "frames h w"],
     silhouettes_of: Callable[[Bool[np.ndarray, "frames h w"]], Bool[np.ndarray, "frames h w"]],
 ) -> list[Finding]:
     """Masks that contradict the visual hull, which is found by vote."""
+    silhouettes = hull.silhouettes
     filled = masks.any(axis=(1, 2))  # an empty mask has its own finding
     contradiction = _contradiction(masks, silhouettes)
     typical = float(np.median(contradiction[filled]))
-    scatter = float(median_abs_deviation(contradiction[filled], scale="normal"))
     outline = masks & ~binary_erosion(masks, np.ones((1, 3, 3), bool))
     pixel = outline.sum() / masks.sum()
     limit = MAX_CONTRADICTION + 0.25 * pixel
@@ -179,16 +180,35 @@ def _hull(
             "visual hull of all, so the masks or the poses are wrong; look at report/masks.png and report/poses.png."
         )
         return [Finding("masks-hull", "red", sentence, {"contradiction": typical})]
-    contradiction = _contradiction(masks & ~_background(masks, silhouettes, brightness), silhouettes)
-    odd = (contradiction > typical + max(MAX_ODDITY + 0.125 * pixel, ODDITY_SIGMAS * scatter)) & filled
-    others = {name: float(c) for name, c, is_odd in zip(names, contradiction, odd, strict=True) if is_odd}
-    if not others:
+    excess = MAX_ODDITY + 0.125 * pixel
+    odd, contradiction = _odd(masks, silhouettes, brightness, filled, excess)
+    if not odd.any():
         return []
+    # The outermost frames of a part of a turn carve alone and are outvoted, but the core agrees with all masks.
+    odd_to_core, to_core = _odd(masks, hull.core_silhouettes, brightness, filled, excess)
+    if not odd_to_core.any() and np.median(to_core[filled]) <= typical:
+        return []
+    others = {name: float(c) for name, c, is_odd in zip(names, contradiction, odd, strict=True) if is_odd}
     sentence = (
         f"The object in {names_in_short([*others])} has another shape than in the other frames: it is another "
         f"object, or it was moved; leave these frames out with {leave_out([*others])}."
     )
     return [Finding("frames-hull", "red", sentence, {"frames": others})]
+
+
+def _odd(
+    masks: Bool[np.ndarray, "frames h w"],
+    silhouettes: Bool[np.ndarray, "frames h w"],
+    brightness: Float[np.ndarray, "frames h w"],
+    filled: Bool[np.ndarray, "frames"],
+    excess: float,
+) -> tuple[Bool[np.ndarray, "frames"], Float[np.ndarray, "frames"]]:
+    """Which masks differ by ``excess`` more from their silhouettes than a typical one, and by how much all differ."""
+    differences = _contradiction(masks, silhouettes)[filled]
+    scatter = float(median_abs_deviation(differences, scale="normal"))
+    contradiction = _contradiction(masks & ~_background(masks, silhouettes, brightness), silhouettes)
+    limit = float(np.median(differences)) + max(excess, ODDITY_SIGMAS * scatter)
+    return (contradiction > limit) & filled, contradiction
 
 
 def _background(

@@ -289,7 +289,7 @@ def _write_masks(
     findings = check_masks(
         masks,
         names,
-        hull.silhouettes,
+        hull,
         brightness,
         left_out,
         lambda others: hull_of(others).silhouettes,

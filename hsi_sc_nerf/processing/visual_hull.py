@@ -52,12 +52,14 @@ class VotedHull:
         sides_m: of a voxel.
         voxel_px: diameter of a voxel in the images, odd.
         silhouettes: pixels of each frame that see the hull.
+        core_silhouettes: pixels of each frame that see the core.
     """
 
     core: Float[np.ndarray, "n 3"]
     sides_m: Float[np.ndarray, "3"]
     voxel_px: int
     silhouettes: Bool[np.ndarray, "frames h w"]
+    core_silhouettes: Bool[np.ndarray, "frames h w"]
 
     def trim(self, masks: Bool[np.ndarray, "frames h w"]) -> Bool[np.ndarray, "frames h w"]:
         """Masks without what most other frames contradict, such as noise on the container's lid.
@@ -106,8 +108,11 @@ def voted_hull(
             break
         low, high = voxels.min(axis=0) - sides / 2.0, voxels.max(axis=0) + sides / 2.0
     core = visual_hull(voxels, dilated, camera_to_worlds, intrinsics)
-    silhouettes = np.stack([_silhouette(voxels, pose, intrinsics, voxel_px) for pose in camera_to_worlds])
-    return VotedHull(core, sides, voxel_px, silhouettes)
+    silhouettes, core_silhouettes = (
+        np.stack([_silhouette(seen, pose, intrinsics, voxel_px) for pose in camera_to_worlds])
+        for seen in (voxels, core)
+    )
+    return VotedHull(core, sides, voxel_px, silhouettes, core_silhouettes)
 
 
 def _silhouette(

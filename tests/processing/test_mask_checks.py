@@ -1,5 +1,7 @@
 """Checks of masks on silhouettes of a sphere and of walls, whose findings are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from capture_factory import SPHERE_CENTRE_M, SPHERE_RADIUS_M, sphere_mask, true_pose
@@ -41,11 +43,11 @@ def findings(masks, brightness=None, regions=None) -> dict[str, str]:
 
 
 def checked(masks, brightness, regions=None, lid_middles=None, left_out=NOTHING):
-    silhouettes = hull_of(masks)
-    return check_masks(masks, NAMES, silhouettes, brightness, left_out, hull_of, regions, lid_middles)
+    hull = voted_hull(masks, POSES, INTRINSICS)
+    return check_masks(masks, NAMES, hull, brightness, left_out, silhouettes_of, regions, lid_middles)
 
 
-def hull_of(masks):
+def silhouettes_of(masks):
     return voted_hull(masks, POSES, INTRINSICS).silhouettes
 
 
@@ -121,8 +123,10 @@ def test_a_narrow_object_differs_from_its_hull_as_the_vote_makes_it():
     def wider(masks):
         return np.stack([dilate(mask, 3) for mask in masks])
 
+    hull = replace(voted_hull(masks, POSES, INTRINSICS), silhouettes=wider(masks))
+
     def names(silhouettes_of):
-        return {f.name for f in check_masks(masks, NAMES, wider(masks), seen(masks), NOTHING, silhouettes_of)}
+        return {f.name for f in check_masks(masks, NAMES, hull, seen(masks), NOTHING, silhouettes_of)}
 
     assert names(lambda others: others) == {"masks-hull"}
     assert names(wider) == set()
@@ -135,6 +139,23 @@ def test_a_frame_of_another_object_is_named(other):
     (finding,) = checked(masks, seen(masks))
     assert (finding.name, finding.level, list(finding.values["frames"])) == ("frames-hull", "red", ["ball_5"])
     assert "--exclude ball_5" in finding.sentence
+
+
+def test_the_ends_of_half_a_turn_show_no_other_object():
+    """Only they carve the hull from their directions, and the others outvote them."""
+    count = 2 * FRAMES
+    poses = np.stack([true_pose(angle) for angle in np.linspace(0.0, 180.0, count)])
+    masks = np.stack([ball(pose, (0.02, 0, 0), 0.025) | ball(pose, (-0.02, 0, 0), 0.025) for pose in poses])
+
+    def frames_named(masks):
+        hull = voted_hull(masks, poses, INTRINSICS)
+        names = [str(frame) for frame in range(count)]
+        found = check_masks(masks, names, hull, seen(masks), np.zeros(count, bool), lambda others: others)
+        return [[*finding.values["frames"]] for finding in found]
+
+    assert frames_named(masks) == []
+    masks[0] = ball(poses[0], (0.02, 0, 0), 0.025)
+    assert frames_named(masks) == [["0"]]
 
 
 @pytest.mark.parametrize(("shows", "found"), [("what the other frames show there", []), ("fruit", ["frames-hull"])])
