@@ -17,10 +17,12 @@ from torch import Tensor
 
 from hsi_sc_nerf.surface.surface_depth import opacity_crossing_depth
 
-REACH = 0.055
-"""A touching ray is followed this far to both sides (about 6 mm). On a sphere of 35 mm it is in the soft density for
-5 mm to both sides; further away it meets other parts of the object."""
-RAY_SAMPLES = 12
+REACH, FAR_REACH = 0.055, 0.11
+"""A touching ray is followed this far to both sides (about 6 and 12 mm). On a sphere of 35 mm it leaves a density that
+grows over 1 mm only by the second. There it may meet other parts of the object, so that its density counts only as
+far as it falls."""
+NEAR_SAMPLES, FAR_SAMPLES = 6, 3
+"""Samples to each side within the first reach, and between both."""
 DIRECTIONS = 4
 """Touching rays through each point, evenly around the normal. The one with the least opacity counts: along the
 strongest curvature, the path through the density is shortest and meets other parts of the object least."""
@@ -94,15 +96,20 @@ def _least_touching_depth(
     A ray in a hollow does not touch: on both sides it goes deeper into the density.
     """
     first, second = tangents
-    step = 2.0 * REACH / RAY_SAMPLES
-    along = (torch.arange(RAY_SAMPLES, device=points.device) + 0.5) * step - REACH
-    depths = []
+    near_step, far_step = REACH / NEAR_SAMPLES, (FAR_REACH - REACH) / FAR_SAMPLES
+    near = (torch.arange(NEAR_SAMPLES, device=points.device) + 0.5) * near_step
+    far = REACH + (torch.arange(FAR_SAMPLES, device=points.device) + 0.5) * far_step
+    along = torch.cat([near, far])[:, None]
+    near_depths, depths = [], []
     for turn in range(DIRECTIONS):
         angle = math.pi * turn / DIRECTIONS
-        direction = math.cos(angle) * first + math.sin(angle) * second
-        depths.append(_density(density_fn, points[:, None] + direction[:, None] * along[:, None]).sum(dim=1) * step)
-    least = torch.stack(depths).amin(dim=0)
-    return least, least < HOLLOW * 2.0 * REACH * _density(density_fn, points)
+        direction = (math.cos(angle) * first + math.sin(angle) * second)[:, None]
+        sides = torch.stack([_density(density_fn, points[:, None] + side * along * direction) for side in (1, -1)])
+        near_depths.append(sides[..., :NEAR_SAMPLES].sum(dim=(0, 2)) * near_step)
+        falling = sides[..., NEAR_SAMPLES - 1 :].cummin(dim=-1).values[..., 1:]
+        depths.append(near_depths[-1] + falling.sum(dim=(0, 2)) * far_step)
+    touches = torch.stack(near_depths).amin(dim=0) < HOLLOW * 2.0 * REACH * _density(density_fn, points)
+    return torch.stack(depths).amin(dim=0), touches
 
 
 def _density(density_fn: Callable[[Tensor], Tensor], points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:

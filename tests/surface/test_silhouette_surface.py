@@ -9,17 +9,17 @@ from hsi_sc_nerf.surface.silhouette_surface import move_to_silhouettes
 FOLDING = 0.004
 
 
-def soft(distance_fn, surface_density):
-    """A density that grows by e over FOLDING into a body, of which distance_fn gives the signed distance."""
-    return lambda points: surface_density * torch.exp(-distance_fn(points) / FOLDING).clamp_max(1e4)[..., None]
+def soft(distance_fn, surface_density, folding=FOLDING):
+    """A density that grows by e over a depth into a body, of which distance_fn gives the signed distance."""
+    return lambda points: surface_density * torch.exp(-distance_fn(points) / folding).clamp_max(1e4)[..., None]
 
 
-def touching_density(radius):
+def touching_density(radius, folding=FOLDING):
     """Density at the surface of a round body at which a ray that touches it collects half an opacity.
 
     Along the ray the distance to the body is t^2 / 2 R, so the optical depth is a Gaussian's integral.
     """
-    return math.log(2.0) / math.sqrt(2.0 * math.pi * radius * FOLDING)
+    return math.log(2.0) / math.sqrt(2.0 * math.pi * radius * folding)
 
 
 def around(radius, count=200):
@@ -29,10 +29,12 @@ def around(radius, count=200):
     return normals * (radius + 0.02 * torch.rand(count, 1, generator=generator) - 0.01), normals
 
 
-@pytest.mark.parametrize("radius", [0.03, 0.1, 0.25])
-def test_a_ball_is_found_whatever_its_radius(radius):
+@pytest.mark.parametrize(("radius", "folding"), [(0.03, 0.004), (0.1, 0.004), (0.25, 0.004), (0.35, 0.008)])
+def test_a_ball_is_found_whatever_its_radius(radius, folding):
+    """The last one is soft over a millimetre, and rays that touch it stay in its density for a centimetre."""
     points, normals = around(radius)
-    moved = move_to_silhouettes(soft(lambda p: p.norm(dim=-1) - radius, touching_density(radius)), points, normals)
+    density_fn = soft(lambda p: p.norm(dim=-1) - radius, touching_density(radius, folding), folding)
+    moved = move_to_silhouettes(density_fn, points, normals)
     torch.testing.assert_close(moved.norm(dim=-1), torch.full((len(points),), radius), atol=1e-3, rtol=0)
 
 
@@ -57,6 +59,17 @@ def test_a_stem_is_found_by_the_rays_across_it():
     moved = move_to_silhouettes(stem, normals * (radius + 0.008), normals)
     # None of the four directions is exactly across the stem: they are up to 22.5 degrees off.
     torch.testing.assert_close(moved.norm(dim=-1), torch.full((len(moved),), radius), atol=1.5e-3, rtol=0)
+
+
+def test_another_part_of_the_object_does_not_count():
+    """All rays that touch the ball end in a shell around it."""
+    radius, shell_radius = 0.1, 0.14
+    density_fn = soft(
+        lambda p: torch.minimum(p.norm(dim=-1) - radius, shell_radius - p.norm(dim=-1)), touching_density(radius)
+    )
+    points, normals = around(radius)
+    moved = move_to_silhouettes(density_fn, points, normals)
+    torch.testing.assert_close(moved.norm(dim=-1), torch.full((len(moved),), radius), atol=1e-3, rtol=0)
 
 
 def test_in_a_hollow_the_opacity_from_the_front_is_that_of_the_rest():
