@@ -1,8 +1,8 @@
-"""Spectral losses as pure functions: the paper's two (section "Loss Function") and the spectral angle itself.
+"""Losses as pure functions: the paper's two (section "Loss Function"), the spectral angle itself, and of weights.
 
-Every loss is a float32 mean over the pixels that count, and 0 with gradient 0 if none does. Values and gradients are
-finite for any finite spectra, float16 included (``hsi_sc_nerf.numerics``). Where ``valid`` is given, values of the
-target that are no measurements change neither the loss nor its gradient.
+Every spectral loss is a float32 mean over the pixels that count, and 0 with gradient 0 if none does. Values and
+gradients are finite for any finite spectra, float16 included (``hsi_sc_nerf.numerics``). Where ``valid`` is given,
+values of the target that are no measurements change neither the loss nor its gradient.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from torch import Tensor
 from hsi_sc_nerf.evaluation.spectral_metrics import cleared, has_angle
 from hsi_sc_nerf.numerics import masked_mean, narrow, one_minus_cosine, spectral_angle, widen
 
+SUPPORT_WEIGHT = 0.1
+"""A ray of which so much is left at the support ends there."""
 DIRECTION_FLOOR = 1e-4
 """Root mean square reflectance below which a spectrum has no usable direction (a packed count is 2e-5)."""
 
@@ -106,6 +108,28 @@ def separate_distortion(
     moment_before = torch.cumsum(weights * middles, dim=-1) - weights * middles
     between = 2.0 * (weights * (middles * before - moment_before)).sum(dim=-1)
     return between + (weights.square() * (ends - starts)).sum(dim=-1) / 3.0
+
+
+def free_space_loss(
+    weights: Float[Tensor, "rays samples"], heights: Float[Tensor, "rays samples"], beside: Bool[Tensor, "rays"]
+) -> Float[Tensor, ""]:
+    """Weight above the support, summed over the rays that pass the object by and end in its support.
+
+    There is nothing but air above the support beside the object. The spectra do not tell: matter of the support's own
+    spectrum in front of it changes no pixel.
+
+    Args:
+        weights: of the samples.
+        heights: of the samples above the support, in any unit.
+        beside: rays through pixels that the object does not cover.
+
+    Example:
+        >>> free_space_loss(torch.tensor([[0.3, 0.7]]), torch.tensor([[0.01, -0.01]]), torch.tensor([True]))
+        tensor(0.3000)
+    """
+    above = weights * (heights > 0.0)
+    in_support = (weights - above).sum(dim=-1).detach() > SUPPORT_WEIGHT
+    return (above.sum(dim=-1) * (beside & in_support)).sum()
 
 
 def _pixels_with_an_angle(

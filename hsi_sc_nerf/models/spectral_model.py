@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle
@@ -37,7 +38,7 @@ from hsi_sc_nerf.models.backgrounds import make_background
 from hsi_sc_nerf.models.build_field import build_field
 from hsi_sc_nerf.models.chosen_effects import chosen_effects, require_effects
 from hsi_sc_nerf.models.compositing import BasisDecoder, SpectralRenderer
-from hsi_sc_nerf.models.losses import angle_loss, angular_loss, hsi_loss, separate_distortion
+from hsi_sc_nerf.models.losses import angle_loss, angular_loss, free_space_loss, hsi_loss, separate_distortion
 from hsi_sc_nerf.models.occupancy_sampler import OccupancySampler, build_occupancy
 from hsi_sc_nerf.models.optimizers import with_network_group
 from hsi_sc_nerf.models.pose_refinement import PoseRefinement, PoseRefinementConfig
@@ -47,6 +48,10 @@ from hsi_sc_nerf.numerics import safe_log10
 from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.processing.spectral_subspace import training_subspace
 
+FREE_SPACE_WEIGHT = 0.01
+"""Of the loss of what is above the support beside the object (docs/validation/surface.md)."""
+SUPPORT_SOFTNESS_M = 0.002
+"""The support's own density reaches this far above it."""
 METRIC_STRIDE = 8
 """The metrics of a batch are those of every so many of its rays: they are drawn, and nothing learns from them."""
 
@@ -166,6 +171,8 @@ class SpectralModel(NerfactoModel):
         else:
             grid = build_occupancy(dataset, metadata["frames"], self.scene_box.aabb, from_checkpoint)
             self.proposal_sampler = OccupancySampler(grid, config.num_nerf_samples_per_ray, config.predict_normals)
+        base, top = metadata["object_box"][:, 2].tolist()
+        self.support_height = base + SUPPORT_SOFTNESS_M * (top - base) / float(np.ptp(dataset.object_box_m[:, 2]))
         self.field = build_field(
             config,
             len(dataset.wavelengths_nm),
@@ -177,7 +184,7 @@ class SpectralModel(NerfactoModel):
             subspace=subspace,
             occupancy=self.occupancy,
             turntable=metadata["turntable"],
-            base=float(metadata["object_box"][0, 2]),
+            base=base,
         )
         self.camera_optimizer = config.camera_optimizer.setup(
             refine="pose_refinement" in self.effects,
@@ -315,12 +322,22 @@ class SpectralModel(NerfactoModel):
             losses["interlevel_loss"] = config.interlevel_loss_mult * interlevel_loss(
                 outputs["weights_list"], outputs["ray_samples_list"]
             )
+        else:
+            losses["free_space_loss"] = FREE_SPACE_WEIGHT * self._free_space(outputs, batch) / len(target)
         losses["distortion_loss"] = config.distortion_loss_mult * metrics_dict["distortion"]
         if config.predict_normals:
             losses["orientation_loss"] = config.orientation_loss_mult * outputs["rendered_orientation_loss"].mean()
             losses["pred_normal_loss"] = config.pred_normal_loss_mult * outputs["rendered_pred_normal_loss"].mean()
         self.camera_optimizer.get_loss_dict(losses)
         return losses
+
+    def _free_space(self, outputs: dict, batch: dict) -> Float[Tensor, ""]:
+        """`free_space_loss` of the rays that were sampled."""
+        assert isinstance(self.proposal_sampler, OccupancySampler)
+        (*_, weights), (*_, samples) = outputs["weights_list"], outputs["ray_samples_list"]
+        beside, sampled = ~batch["mask"].to(self.device)[:, 0], self.proposal_sampler.rays
+        heights = samples.frustums.get_positions()[..., 2] - self.support_height
+        return free_space_loss(weights[..., 0], heights, beside if sampled is None else beside[sampled])
 
     def get_image_metrics_and_images(self, outputs: dict, batch: dict) -> tuple[dict[str, float], dict[str, Tensor]]:
         """The paper's metrics of a held-out view, masked to the foreground and (``full_``) over the whole frame."""

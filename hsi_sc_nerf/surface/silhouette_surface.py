@@ -18,9 +18,9 @@ from torch import Tensor
 from hsi_sc_nerf.surface.surface_depth import opacity_crossing_depth
 
 REACH, FAR_REACH = 0.055, 0.11
-"""A touching ray is followed this far to both sides (about 6 and 12 mm). On a sphere of 35 mm it leaves a density that
-grows over 1 mm only by the second. There it may meet other parts of the object, so that its density counts only as
-far as it falls."""
+"""A touching ray is followed this far to both sides (about 6 and 12 mm). On a sphere of 35 mm it leaves a density
+that grows over 1 mm only by the second. There it may meet other parts of the object, and what rises again is not
+counted."""
 NEAR_SAMPLES, FAR_SAMPLES = 6, 3
 """Samples to each side within the first reach, and between both."""
 DIRECTIONS = 4

@@ -8,6 +8,7 @@ from hsi_sc_nerf.models.losses import (
     DIRECTION_FLOOR,
     angle_loss,
     angular_loss,
+    free_space_loss,
     hsi_loss,
     separate_distortion,
 )
@@ -147,3 +148,22 @@ def test_distortion_of_samples_apart_counts_the_gap() -> None:
     # Twice 0.5 x 0.5 over a distance of 3, and 0.25 x 0.1 / 3 within each.
     expected = 2 * 0.25 * 3.0 + 2 * 0.25 * 0.1 / 3
     assert separate_distortion(weights, starts, starts + 0.1).item() == pytest.approx(expected)
+
+
+def test_matter_above_the_support_beside_the_object_costs_its_weight() -> None:
+    """Rays: haze before the support, the same through the object, past the support, and without haze."""
+    weights = torch.tensor([[0.3, 0.2, 0.5], [0.3, 0.2, 0.5], [0.3, 0.2, 0.05], [0.0, 0.0, 1.0]], requires_grad=True)
+    heights = torch.tensor([0.02, 0.01, -0.01]).expand(4, 3)
+    loss = free_space_loss(weights, heights, torch.tensor([True, False, True, True]))
+    assert loss.item() == pytest.approx(0.3 + 0.2)
+    (gradient,) = torch.autograd.grad(loss, weights)
+    expected = torch.zeros(4, 3)
+    expected[[0, 3], :2] = 1.0
+    torch.testing.assert_close(gradient, expected)
+
+
+def test_no_ray_beside_the_object_costs_nothing() -> None:
+    weights = torch.zeros(0, 16, requires_grad=True)
+    loss = free_space_loss(weights, torch.zeros(0, 16), torch.zeros(0, dtype=torch.bool))
+    assert loss.item() == 0.0
+    assert torch.isfinite(torch.autograd.grad(loss, weights)[0]).all()

@@ -103,7 +103,7 @@ def events(tiny_dataset, tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_events_of_a_run(events):
     tags = events.Tags()
-    losses = ["hsi_loss", "angular_loss", "distortion_loss"]
+    losses = ["hsi_loss", "angular_loss", "free_space_loss", "distortion_loss"]
     metrics = ["sam", "rmse", "psnr", "camera_opt_translation", "camera_opt_rotation_deg", "camera_opt_angle_max_deg"]
     expected = {
         *(f"Train Loss Dict/{name}" for name in [*losses, "camera_opt_regularizer"]),
