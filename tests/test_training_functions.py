@@ -22,7 +22,7 @@ from hsi_sc_nerf.fields.spectral_field import CoefficientGain, SpectralField, Sp
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, cross_matrix, look_at
 from hsi_sc_nerf.models.backgrounds import Background, interpolate_image
 from hsi_sc_nerf.models.compositing import BasisDecoder, SpectralRenderer
-from hsi_sc_nerf.models.losses import separate_distortion
+from hsi_sc_nerf.models.losses import free_space_loss, separate_distortion
 from hsi_sc_nerf.models.optimizers import with_alike_singular_values
 from hsi_sc_nerf.models.pose_refinement import PoseRefinementConfig
 from hsi_sc_nerf.numerics import safe_log10, safe_ratio, safe_sqrt
@@ -136,6 +136,10 @@ def penalty():
 
 CASES = {
     "distortion": lambda: (separate_distortion, [random(3, 5, seed=1), *segments()]),
+    "free space": lambda: (
+        lambda weights: free_space_loss(weights, torch.tensor([0.2, 0.1, 0.1, -0.1, -0.1]), torch.arange(3) > 0),
+        [random(3, 5, seed=1)],
+    ),
     "weights": lambda: (light_through, [random(3, 5, 1, seed=1)]),
     "spectrum": lambda: spectrum(False),
     "spectrum, last sample behind": lambda: spectrum(True),
@@ -164,7 +168,9 @@ def test_gradients_match_finite_differences(case):
 
 
 @pytest.mark.parametrize("dtype", LOW_PRECISIONS, ids=str)
-@pytest.mark.parametrize("case", ["distortion", "spectrum", "spectrum, last sample behind", "gain", "shading"])
+@pytest.mark.parametrize(
+    "case", ["distortion", "free space", "spectrum", "spectrum, last sample behind", "gain", "shading"]
+)
 def test_low_precision_is_that_of_float64(case, dtype):
     """Of what mixed precision may hand half of the digits: all else is computed in float32 there."""
     function, leaves = CASES[case]()
