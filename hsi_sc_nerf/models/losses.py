@@ -16,8 +16,6 @@ from torch import Tensor
 from hsi_sc_nerf.evaluation.spectral_metrics import cleared, has_angle
 from hsi_sc_nerf.numerics import masked_mean, narrow, one_minus_cosine, spectral_angle, widen
 
-SUPPORT_WEIGHT = 0.1
-"""A ray of which so much is left at the support ends there."""
 DIRECTION_FLOOR = 1e-4
 """Root mean square reflectance below which a spectrum has no usable direction (a packed count is 2e-5)."""
 
@@ -113,7 +111,7 @@ def separate_distortion(
 def free_space_loss(
     weights: Float[Tensor, "rays samples"], heights: Float[Tensor, "rays samples"], beside: Bool[Tensor, "rays"]
 ) -> Float[Tensor, ""]:
-    """Weight above the support, summed over the rays that pass the object by and end in its support.
+    """Weight above the support, summed over the rays that pass the object by and reach its support.
 
     There is nothing but air above the support beside the object. The spectra do not tell: matter of the support's own
     spectrum in front of it changes no pixel.
@@ -127,9 +125,8 @@ def free_space_loss(
         >>> free_space_loss(torch.tensor([[0.3, 0.7]]), torch.tensor([[0.01, -0.01]]), torch.tensor([True]))
         tensor(0.3000)
     """
-    above = weights * (heights > 0.0)
-    in_support = (weights - above).sum(dim=-1).detach() > SUPPORT_WEIGHT
-    return (above.sum(dim=-1) * (beside & in_support)).sum()
+    above = heights > 0.0
+    return (weights * (above & (beside & ~above.all(dim=-1))[:, None])).sum()
 
 
 def _pixels_with_an_angle(

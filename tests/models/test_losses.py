@@ -152,8 +152,9 @@ def test_distortion_of_samples_apart_counts_the_gap() -> None:
 
 def test_matter_above_the_support_beside_the_object_costs_its_weight() -> None:
     """Rays: haze before the support, the same through the object, past the support, and without haze."""
-    weights = torch.tensor([[0.3, 0.2, 0.5], [0.3, 0.2, 0.5], [0.3, 0.2, 0.05], [0.0, 0.0, 1.0]], requires_grad=True)
-    heights = torch.tensor([0.02, 0.01, -0.01]).expand(4, 3)
+    weights = torch.tensor([[0.3, 0.2, 0.5], [0.3, 0.2, 0.5], [0.3, 0.2, 0.5], [0.0, 0.0, 1.0]], requires_grad=True)
+    heights = torch.tensor([0.02, 0.01, -0.01]).repeat(4, 1)
+    heights[2, 2] = 0.01
     loss = free_space_loss(weights, heights, torch.tensor([True, False, True, True]))
     assert loss.item() == pytest.approx(0.3 + 0.2)
     (gradient,) = torch.autograd.grad(loss, weights)
