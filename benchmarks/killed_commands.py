@@ -270,7 +270,13 @@ def main(
         only: part of the names of the commands to disturb; the other rows of the tables are kept.
         keep: folder for the session and the undisturbed results; what lies there is not made again.
         results: folder of the tables.
+
+    Raises:
+        SystemExit: no command has such a name.
     """
+    names = [command.name for command in commands(Path())]
+    if not any(only in name for name in names):
+        raise SystemExit(f"--only {only}: no command has that in its name; take one of {', '.join(names)}.")
     with tempfile.TemporaryDirectory() as temporary:
         inputs, folder = (keep or Path(temporary) / "inputs").absolute(), Path(temporary) / "disturbed"
         if not (inputs / "session").is_dir():
