@@ -12,11 +12,13 @@ folder that was loaded. TensorBoard's logs are not compared, for they hold times
 the speeds among the metrics of a stage. A file is half-written if it lies under its final name, has not the
 reference's bytes, and cannot be read as JSON, PNG, checkpoint or settings. A moment that comes after the command's
 end, which differs from run to run, is drawn again for a shorter duration. All durations are processor time of the
-command, so that other work on the machine changes neither the moments nor what is taken for "goes on". Linux alone.
+command, so that other work on the machine changes neither the moments nor what is taken for "goes on". With --keep, a
+run that was stopped goes on with the next moments. Linux alone.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import resource
@@ -26,15 +28,17 @@ import subprocess
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import tyro
 from left_files import differences, files_in, half_written, leftovers, state_of
-from results_table import RESULTS, write_results
+from results_table import RESULTS, current_commit, write_results
 
 from hsi_sc_nerf.benchmark.steps import typed_command
+from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
 
@@ -194,6 +198,20 @@ def killed(command: Command, folder: Path, reference: Path, expected: list[Momen
     return found
 
 
+def in_pieces(
+    expected: list[Moment], size: int, counted: Callable[[list[Moment]], Counter[str]], saved: Path
+) -> Counter[str]:
+    """What ``counted`` finds at all moments, ``size`` of them at a time, kept in a file after each time."""
+    done, counts = 0, Counter[str]()
+    if saved.is_file():
+        content = json.loads(saved.read_text())
+        done, counts = content["done"], Counter(content["counts"])
+    for first in range(done, len(expected), size):
+        counts += counted(expected[first : first + size])
+        write_json(saved, {"done": first + size, "counts": counts})
+    return counts
+
+
 def pressed(command: Command, folder: Path, reference: Path, expected: list[Moment]) -> Counter[str]:
     """Press Ctrl-C once at every moment, each time in a new folder."""
     counts: Counter[str] = Counter()
@@ -268,9 +286,15 @@ def main(
         presses: moments at which each command gets Ctrl-C; likewise.
         seed: of both.
         only: part of the names of the commands to disturb; the other rows of the tables are kept.
-        keep: folder for the session and the undisturbed results; what lies there is not made again.
+        keep: folder for the session, the undisturbed results and what was counted; what lies there is not made again.
         results: folder of the tables.
+
+    Raises:
+        SystemExit: no command has such a name.
     """
+    names = [command.name for command in commands(Path())]
+    if not any(only in name for name in names):
+        raise SystemExit(f"--only {only}: no command has that in its name; take one of {', '.join(names)}.")
     with tempfile.TemporaryDirectory() as temporary:
         inputs, folder = (keep or Path(temporary) / "inputs").absolute(), Path(temporary) / "disturbed"
         if not (inputs / "session").is_dir():
@@ -281,23 +305,26 @@ def main(
         for command in every[: last + 1]:
             if only not in command.name and (inputs / command.name).is_dir():
                 continue
-            shutil.rmtree(inputs / command.name, ignore_errors=True)
-            first_file_s, seconds = undisturbed(command, inputs / command.name)
+            # Moments of another commit, or of another number of them, are others.
+            counted = inputs / "counted" / f"{current_commit()}-{seed}-{kills}-{presses}-{command.name}"
+            durations = counted / "durations.json"
+            if not (durations.is_file() and (inputs / command.name).is_dir()):
+                shutil.rmtree(inputs / command.name, ignore_errors=True)
+                write_json(durations, {"all": undisturbed(command, inputs / command.name)})
+            first_file_s, seconds = json.loads(durations.read_text())["all"]
             if only not in command.name:
                 continue
-            rng = random.Random(f"{seed} {command.name}")
-            for name, columns, count in (
-                ("killed_commands", KILLED, kills),
-                ("interrupted_commands", STOPPED, presses),
+            rng, reference = random.Random(f"{seed} {command.name}"), inputs / command.name
+            for name, columns, count, size, count_at in (
+                ("killed_commands", KILLED, kills, KILLS_IN_A_ROW, killed),
+                ("interrupted_commands", STOPPED, presses, 1, pressed),
             ):
                 expected = list(moments(count, first_file_s, seconds, rng))
                 if not expected:
                     continue
                 rng.shuffle(expected)
-                if name == "killed_commands":
-                    counts = killed(command, folder, inputs / command.name, expected)
-                else:
-                    counts = pressed(command, folder, inputs / command.name, expected)
+                counting = partial(count_at, command, folder, reference)
+                counts = in_pieces(expected, size, counting, counted / f"{name}.json")
                 known = {"command": command.name, "undisturbed, s": f"{seconds:.1f}", "moments": count}
                 row = [str(known.get(column, counts[column])) for column in columns]
                 write_results(name, columns, [row], keys=1, seed=str(seed), folder=results)

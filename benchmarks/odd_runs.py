@@ -134,6 +134,7 @@ def train(case: Case, scene: Scene, folder: Path, steps: int) -> Ended:
     skipped = 0
     try:
         case.settings(config)
+        torch.manual_seed(config.machine.seed)  # as ns-train does: it draws the weights
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
         case.trainer(trainer)

@@ -45,6 +45,8 @@ _EXPORTED = (
     *("transforms_train.json", "transforms_eval.json"),
 )
 """Files that nerfstudio's exports write, and do not write whole."""
+_RENDERED = (".png", ".jpg", ".mp4", ".gz")
+"""And endings of those that its renders write."""
 _FULL_BYTES = 1 << 12
 """A disk with less free is full."""
 _PICTURES = ("gt-rgb", "rgb", "accumulation", "depth", "expected_depth")
@@ -110,7 +112,7 @@ def _adapted(original: Callable[[Any], None]) -> Callable[[Any], None]:
 
 @contextmanager
 def _nothing_half_exported(command: Any) -> Iterator[None]:
-    """On a full disk, delete what an export had begun; libraries tell of it in their own ways, or not at all.
+    """On a full disk, delete what an export or a render had begun; libraries tell of it in their own ways or not.
 
     Raises:
         InputError: the disk is full.
@@ -128,7 +130,12 @@ def _nothing_half_exported(command: Any) -> Iterator[None]:
         if failure is not None:
             raise failure
         return
-    for path in (folder / name for name in _EXPORTED):
+    begun = [folder / name for name in _EXPORTED]
+    # Renders write a file, or pictures in a folder of its name.
+    if hasattr(command, "rendered_output_names"):
+        places = [folder, *folder.rglob("*"), *folder.with_suffix("").rglob("*")]
+        begun = [path for path in places if path.suffix in _RENDERED]
+    for path in begun:
         if path.is_file() and path.stat().st_mtime >= started:
             path.unlink()
     raise InputError(f"{folder}: cannot be written to, because the disk is full; free some space.") from failure

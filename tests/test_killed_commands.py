@@ -7,12 +7,13 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-from killed_commands import Command, Moment, goes_on_after_ctrl_c, moments, start
+from killed_commands import Command, Moment, goes_on_after_ctrl_c, in_pieces, main, moments, start
 from left_files import differences, half_written, leftovers
 
 from hsi_sc_nerf.files import atomic_write, write_json
@@ -60,6 +61,28 @@ def test_moments_are_spread_and_repeat():
     assert [int(moment.after_s / (2.0 if moment.writing else 2.4)) for moment in found] == [*range(5), *range(5)]
     assert [moment.writing for moment in found] == [False] * 5 + [True] * 5
     assert found == list(moments(10, 2.0, 12.0, random.Random(1)))
+
+
+def test_a_run_that_was_stopped_goes_on_with_the_next_moments(tmp_path):
+    expected, seen = list(moments(5, 2.0, 12.0, random.Random(1))), []
+
+    def counted(piece):
+        seen.append(piece)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+        return Counter({"runs to the end": 1, "leftovers": len(piece)})
+
+    with pytest.raises(KeyboardInterrupt):
+        in_pieces(expected, 2, counted, tmp_path / "counts.json")
+    assert in_pieces(expected, 2, counted, tmp_path / "counts.json") == {"runs to the end": 3, "leftovers": 5}
+    assert seen == [expected[:2], expected[2:4], expected[2:4], expected[4:]]
+    assert in_pieces(expected, 2, pytest.fail, tmp_path / "counts.json")["leftovers"] == 5
+
+
+def test_an_unknown_command_is_one_sentence(tmp_path):
+    with pytest.raises(SystemExit, match=r"^--only unknown: no command [^\n]*process, ns-train, ns-export[^\n]*\.$"):
+        main(only="unknown", keep=tmp_path)
+    assert list(tmp_path.iterdir()) == []
 
 
 IGNORES = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"

@@ -228,6 +228,26 @@ def test_an_export_on_a_full_disk_is_one_sentence_and_leaves_nothing(
     assert {path.name for path in out.iterdir()} == left
 
 
+RENDERED = {"DatasetRender": ["views/1.jpg", "views/1.npy.gz"], "RenderInterpolated": ["views.mp4", "views/1.png"]}
+
+
+@pytest.mark.parametrize("kind", RENDERED)
+def test_a_render_on_a_full_disk_is_one_sentence_and_leaves_nothing_of_it(ours, tmp_path, kind):
+    options: dict = {"rendered_output_names": ["rgb"], "downscale_factor": None, "pose_source": "train"}
+    made = command(kind, with_checkpoint(ours), output_path=tmp_path / RENDERED[kind][0].split("/")[0], **options)
+    before = [path for path in tmp_path.rglob("*") if path.is_file()]
+
+    def render(self):
+        (tmp_path / "views").mkdir()
+        for name in RENDERED[kind]:
+            (tmp_path / name).write_text("half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(SystemExit, match=r"^hsi-sc-nerf: [^\n]*the disk is full; free some space\.$"):
+        adapter._adapted(render)(made)
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == before
+
+
 def test_poisson_estimates_normals_where_the_model_has_none(ours):
     made = command("ExportPoissonMesh", with_checkpoint(ours), normal_method="model_output")
     assert adapter.prepare(made) is True

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -10,6 +12,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
+from jaxtyping import UInt8
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -20,6 +23,8 @@ from hsi_sc_nerf.models.spectral_model import SpectralModel
 
 SCENE_BUFFERS = ("aabb", "axis_origin")
 """Buffers that place the scene; weights are meaningless in another scene box."""
+_FRAMES = "frames"
+"""Buffer of the frames' names: with other ones, training views could be held out and judged as unseen."""
 
 
 @dataclass
@@ -36,6 +41,7 @@ class SpectralPipeline(VanillaPipeline):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
+        self.register_buffer(_FRAMES, digest_of_frames(self.datamanager))
         grid = cast(SpectralModel, self.model).occupancy
         if grid is not None and self.test_mode == "val":  # nerfstudio's name for training
             metadata = self.datamanager.train_dataparser_outputs.metadata
@@ -48,11 +54,17 @@ class SpectralPipeline(VanillaPipeline):
         nerfstudio would load the weights that fit, into a scene box that may have moved since.
         """
         own = self.state_dict()
+        loaded_state = {_FRAMES: own[_FRAMES]} | loaded_state  # earlier versions do not tell their frames
         different = own.keys() ^ loaded_state.keys()
         if different:
             raise SystemExit(
                 "hsi-sc-nerf: the checkpoint was made with other settings of the model or by another version "
                 f"({', '.join(sorted(different)[:3])}); take the settings of the config.yml beside it, or train anew."
+            )
+        if not torch.equal(own[_FRAMES].cpu(), loaded_state[_FRAMES].cpu()):
+            raise SystemExit(
+                f"hsi-sc-nerf: {self.datamanager.get_datapath()} has other frames than when the checkpoint was "
+                "trained, or holds out other ones; put back what was removed or renamed, or train again."
             )
         if any(
             value.shape != loaded_state[name].shape
@@ -92,6 +104,13 @@ class SpectralPipeline(VanillaPipeline):
         if get_std and views.judged == 1:
             metrics |= dict.fromkeys((name for name in metrics if name.endswith("_std")), 0.0)
         return {name: value for name, value in metrics.items() if not math.isnan(value)}
+
+
+def digest_of_frames(manager: SpectralDataManager) -> UInt8[torch.Tensor, "32"]:
+    """SHA-256 of the names of a dataset's frames, in their order, and of those that are trained on."""
+    metadata = manager.train_dataparser_outputs.metadata
+    names = [[frame.capture for frame in frames] for frames in (metadata["dataset"].frames, metadata["frames"])]
+    return torch.tensor(list(hashlib.sha256(json.dumps(names).encode()).digest()), dtype=torch.uint8)
 
 
 class _JudgedViews:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from odd_runs import CASES, simulated, train
@@ -34,3 +35,13 @@ def test_odd_runs_end_finite_or_with_one_sentence(scene, tmp_path, name):
     assert bool(ended.message) == (name in STOPS)
     assert "\n" not in ended.message
     assert name in STOPS or np.isfinite([ended.before, ended.after]).all()
+
+
+@pytest.mark.slow
+def test_an_odd_run_has_the_same_figures_whatever_was_drawn_before(scene, tmp_path):
+    found = []
+    for number in range(2):
+        torch.rand(number + 1)
+        found.append(train(CASES[0], scene, tmp_path / str(number), steps=2))
+    assert found[0] == found[1]
+    assert found[0].after != found[0].before

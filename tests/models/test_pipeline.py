@@ -3,6 +3,7 @@
 import copy
 import math
 import shutil
+import types
 from dataclasses import replace
 
 import numpy as np
@@ -13,8 +14,9 @@ from small_trainer import shrink
 
 from hsi_sc_nerf.config import hsi_sc_nerf
 from hsi_sc_nerf.files import write_png
-from hsi_sc_nerf.models.pipeline import SpectralPipeline
+from hsi_sc_nerf.models.pipeline import SpectralPipeline, digest_of_frames
 from hsi_sc_nerf.packed.cube import FLAGGED
+from hsi_sc_nerf.packed.dataset import open_packed, write_transforms
 
 
 def view(pixels, valid=None):
@@ -155,6 +157,34 @@ def test_weights_of_another_dataset_or_model_are_refused(pipeline, changed, told
         state[name] = state[name] * 1.01 if "aabb" in name else state[name][..., :-1]
     with pytest.raises(SystemExit, match=told):
         pipeline.load_pipeline(state, 0)
+
+
+@pytest.mark.slow
+def test_a_dataset_from_which_a_frame_was_removed_is_refused(flagged_dataset, tmp_path):
+    data = shutil.copytree(flagged_dataset, tmp_path / "data")
+    config = pipeline_config(data)
+    config.model.effects = "none"  # nothing in the model has the frames' number
+    state = config.setup(device="cpu").state_dict()
+    dataset = open_packed(data)
+    write_transforms(replace(dataset, frames=dataset.frames[1:]))
+    changed = config.setup(device="cpu", test_mode="test")
+    with pytest.raises(SystemExit, match=r"^hsi-sc-nerf: [^\n]*data has other frames than [^\n]*\.$"):
+        changed.load_pipeline(state, 0)
+    del state["frames"]  # as earlier versions
+    changed.load_pipeline(state, 0)
+
+
+def test_frames_are_told_by_their_names_their_order_and_those_that_are_held_out():
+    def told(frames, trained):
+        every, some = ([types.SimpleNamespace(capture=name) for name in names] for names in (frames, trained))
+        metadata = {"dataset": types.SimpleNamespace(frames=every), "frames": some}
+        outputs = types.SimpleNamespace(metadata=metadata)
+        return tuple(digest_of_frames(types.SimpleNamespace(train_dataparser_outputs=outputs)).tolist())
+
+    assert told("abc", "ac") == told("abc", "ac")
+    assert (
+        len({told(*case) for case in (("abc", "ac"), ("abx", "ax"), ("ac", "ac"), ("bac", "ac"), ("abc", "ab"))}) == 5
+    )
 
 
 def test_a_basis_has_no_spectrum_at_the_last_sample(flagged_dataset):

@@ -11,6 +11,7 @@ from PIL import Image
 
 from hsi_sc_nerf.cli.trained_runs import RenderCommand
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.geometry.camera import in_camera_frame, pixel_rays
 from hsi_sc_nerf.models import trained_run
 from hsi_sc_nerf.packed.dataset import open_packed
@@ -101,6 +102,20 @@ def test_a_video_holds_its_frames(tmp_path):
         frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)]
     assert [frame.shape for frame in frames] == [(32, 46, 3)] * 3
     np.testing.assert_allclose([frame.mean() for frame in frames], shades, atol=3)
+
+
+@pytest.mark.parametrize("frames", [1, 40])  # written when the video ends, and while frames are added
+def test_a_video_on_a_full_disk_is_one_sentence_and_leaves_nothing(tmp_path, limit_of_files, frames):
+    def record(noise):
+        with atomic_write(tmp_path / "video.mp4") as (temporary,), open_video(temporary, 5) as add_frame:
+            for frame in noise:
+                add_frame(frame)
+
+    noise = np.random.default_rng(0).integers(0, 255, (frames, 64, 64, 3), np.uint8)
+    told = r"video\.mp4: cannot be written \(.*\); free some space"
+    with limit_of_files(100), pytest.raises(InputError, match=told):
+        record(noise)
+    assert list(tmp_path.iterdir()) == []
 
 
 def camera_path(tmp_path, pose, **changes):
