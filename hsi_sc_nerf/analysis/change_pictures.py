@@ -38,13 +38,12 @@ def draw_change(path: Path, first: Day, one: Comparison, quantity: Quantity, vie
     lit = colormaps[INDEX_COLOURS](p / -np.log10(_SMALLEST_P))[:, :3]
     lit[~quantity.changed] *= 0.6
     undecided = quantity.undecided
+    tested = "p-value, -log10\noutlined areas lit" + ("\nundecided striped" if undecided.any() else "")
     rows = {
         "before": views.on_white(_natural(first, first)),
         "after": views.on_white(_natural(one.after, first)),
         f"{quantity.name}\nchange ({quantity.unit})": views.on_white(colours(quantity.change)),
-        "p-value, -log10\noutlined areas lit" + "\nundecided striped" * undecided.any(): views.on_white(
-            np.where(np.isfinite(quantity.change)[:, None], lit, GREY), undecided
-        ),
+        tested: views.on_white(np.where(np.isfinite(quantity.change)[:, None], lit, GREY), undecided),
     }
     draw_rows(path, rows, (None, None, (low, high, name), (0.0, -np.log10(_SMALLEST_P), INDEX_COLOURS)))
 

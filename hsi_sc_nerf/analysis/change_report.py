@@ -174,12 +174,14 @@ def _undecided(comparisons: Sequence[Comparison], rows: Sequence[Mapping[str, An
     if limit_m2 == 0.0:
         return []
     told = (
-        f"Without a second capture of the first day, two captures of one day show regions of up to "
-        f"{_CM2_PER_M2 * limit_m2:.2g} cm² (limit of blank) that are no change. "
+        f"Two captures of one day show regions of up to {_CM2_PER_M2 * limit_m2:.2g} cm² that are no change (limit of "
+        "blank). "
     )
     if not rows:
-        return [told + "No region is below it."]
-    told += "Those below are not counted as changed; a second capture (--repeat) decides."
+        return [told + "No region here is as small."]
+    told += (
+        "Those of this table are no larger and are not counted; a second capture of the first day (--repeat) decides."
+    )
     return ["## Undecided: below the limit of blank", told, *_table(rows)]
 
 
@@ -206,8 +208,8 @@ def _cell(value: Any, numbers: str = ".6g") -> str:
 def write_change_ply(path: Path, first: Day, comparisons: Sequence[Comparison]) -> None:
     """The first day's mesh and spectra; of each later day change, p-value and region of each quantity.
 
-    Columns are named ``QUANTITY_KIND_DAY``: ``ndvi_change_1``, ``ndvi_p_1`` and ``ndvi_region_1`` (0 outside, negative
-    if undecided) of the second cloud. The surface's change is in metres, as all lengths of the file.
+    Columns are named ``QUANTITY_KIND_DAY``: ``ndvi_change_1``, ``ndvi_p_1`` and ``ndvi_region_1`` of the second cloud;
+    outside regions 0, negative in undecided ones. The surface's change is in metres, as all lengths of the file.
     """
     extra = {}
     for day, one in enumerate(comparisons, start=1):
