@@ -21,6 +21,7 @@ import numpy as np
 import tyro
 from another_day import HEIGHT_M, STAND_M, Kind, SetDown, bruise_cm2, dried_materials, fruit_of, set_down
 from change_over_time import AGAIN, GROWN, MESH, NEAR_M, SESSION_SD, beside
+from jaxtyping import Bool
 from results_table import RESULTS, write_results
 from rich.progress import track
 from scipy.spatial import cKDTree
@@ -43,15 +44,17 @@ EVERY = 4
 """So many points for each one that is compared, to save time."""
 EFFECTS = ("photon_noise", "read_noise", "{lamp_drift: {percent: -3.0}}")
 NM = np.linspace(400.0, 1000.0, BANDS)
-REPEAT = "repeat"
+REPEAT, SECOND = "repeat", "second capture"
 DAYS = {
     "first": SetDown(AGAIN),
     REPEAT: SetDown(AGAIN, turn_deg=90.0, tip_deg=2.0),
-    "second capture": SetDown(AGAIN, turn_deg=200.0, tip_deg=4.0),
+    SECOND: SetDown(AGAIN, turn_deg=200.0, tip_deg=4.0),
     "grown, 10 % dried": SetDown(GROWN, dried=0.1, turn_deg=30.0, tip_deg=3.0),
 }
 COLUMNS = ("fruit", "day", "second capture of the first day", "turn, °", "turn found, °", "bruise grew, cm²")
-COLUMNS += ("by brightness, cm²", "false change, cm²", "in quantities")
+COLUMNS += ("by brightness, cm²", "false change, cm²", "largest undecided, cm²", "in quantities")
+AFTER_REPEAT = f"{REPEAT}, then second capture"
+"""Another pair of captures of the first day."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,10 @@ class ChangeOfRuns:
             days = [first, *(day for day in later if day is not given)]
             found = compare_days(days, (), indices, SESSION_SD, repeat=given)
             rows += [self._row(fruit, one, given) for one in found]
+        blank = [day for day in later if day.name in (REPEAT, SECOND)]
+        if len(blank) == 2:
+            (one,) = compare_days(blank, (), indices, SESSION_SD)
+            rows.append(self._row(fruit, one, None, AFTER_REPEAT))
         return rows
 
     def _days(self, fruit: int) -> list[Day]:
@@ -100,14 +107,16 @@ class ChangeOfRuns:
     def _fruit(self, seed: int, day: SetDown) -> TrueObject:
         return fruit_of(day, NM, self.kind, seed, self.height_m)
 
-    def _row(self, fruit: int, one: Comparison, repeat: Day | None) -> list[str]:
-        day, attitude, regions = DAYS[one.after.name], one.after.attitude, one.quantities[BRIGHTNESS].regions
+    def _row(self, fruit: int, one: Comparison, repeat: Day | None, name: str = "") -> list[str]:
+        day, attitude, brightness = DAYS[one.after.name], one.after.attitude, one.quantities[BRIGHTNESS]
         assert attitude is not None
         grew = by_brightness = ""
         before, after = (self._fruit(fruit, each) for each in (DAYS["first"], day))
         if day.bruise_diameter_m != AGAIN:
             true_cm2 = bruise_cm2(after) - bruise_cm2(before)
-            grew, by_brightness = f"{true_cm2:.2f}", beside(1e4 * regions[0].area_m2, true_cm2) if regions else "none"
+            grew, by_brightness = f"{true_cm2:.2f}", "none"
+            if brightness.counted:
+                by_brightness = beside(1e4 * brightness.regions[0].area_m2, true_cm2)
         surface = one.after.surface
         # A simulated session has its object on the axis.
         placed = set_down(DAYS["first"], before.mesh.vertices)(before.mesh.vertices)
@@ -115,17 +124,21 @@ class ChangeOfRuns:
         placed += [-centre[0], -centre[1], STAND_M - placed[:, 2].min()]
         bruise = before.materials.index("bruise")
         differs = np.abs(after.weights[:, bruise] - before.weights[:, bruise]) > 0.02
-        far = cKDTree(placed[differs]).query(surface.mesh.vertices)[0] > NEAR_M if differs.any() else True
+        far = np.ones(len(surface.mesh.vertices), bool)
+        if differs.any():
+            far = cKDTree(placed[differs]).query(surface.mesh.vertices)[0] > NEAR_M
         false = {name: one.changed & far for name, one in one.quantities.items()}
         false_cm2 = 1e4 * surface.areas_m2[np.any([*false.values()], axis=0)].sum()
-        named = ", ".join(name for name, inside in false.items() if inside.any())
+        undecided = _undecided_cm2(one, far)
+        named = ", ".join(quantity for quantity in false if false[quantity].any() or undecided[quantity])
         cells = [
             f"{day.turn_deg:g}",
             f"{attitude.turn_deg % 360:.2f} ± {attitude.turn_sd_deg:.2f}",
             grew,
             by_brightness,
         ]
-        return [self._name(fruit), one.after.name, "yes" if repeat else "no", *cells, f"{false_cm2:.2f}", named]
+        cells += [f"{false_cm2:.2f}", f"{max(undecided.values()):.2f}", named]
+        return [self._name(fruit), name or one.after.name, "yes" if repeat else "no", *cells]
 
     def _cloud(self, seed: int, name: str) -> SpectralCloud:
         """The cloud of a short training on a simulated session of the fruit on that day."""
@@ -163,6 +176,16 @@ class ChangeOfRuns:
             if not left.exists():
                 run_step(name, typed_command(words), folder / f"{name}.log")
         return read_spectral_ply(cloud).select(slice(None, None, EVERY))
+
+
+def _undecided_cm2(one: Comparison, far: Bool[np.ndarray, "v"]) -> dict[str, float]:
+    """Area of the largest undecided region of each quantity that lies away from what changed; 0 for none."""
+    areas_m2, largest = one.after.surface.areas_m2, {}
+    for name, quantity in one.quantities.items():
+        insides = [quantity.region == number for number in range(quantity.counted, len(quantity.regions))]
+        away = [inside for inside in insides if np.average(far[inside], weights=areas_m2[inside]) > 0.5]
+        largest[name] = 1e4 * max((areas_m2[inside].sum() for inside in away), default=0.0)
+    return largest
 
 
 if __name__ == "__main__":

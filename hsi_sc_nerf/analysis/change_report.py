@@ -208,9 +208,9 @@ def _cell(value: Any, numbers: str = ".6g") -> str:
 def write_change_ply(path: Path, first: Day, comparisons: Sequence[Comparison]) -> None:
     """The first day's mesh and spectra; of each later day change, p-value and region of each quantity.
 
-    Columns are named ``QUANTITY_KIND_DAY``: ``ndvi_change_1``, ``ndvi_p_1`` and ``ndvi_region_1`` of the second cloud. A
-    region's number is 0 outside and negative if it is undecided. The surface's change is in metres, as all lengths of
-    the file.
+    Columns are named ``QUANTITY_KIND_DAY``: ``ndvi_change_1``, ``ndvi_p_1`` and ``ndvi_region_1`` of the second
+    cloud. A region's number is 0 outside and negative if it is undecided. The surface's change is in metres, as all
+    lengths of the file.
     """
     extra = {}
     for day, one in enumerate(comparisons, start=1):
