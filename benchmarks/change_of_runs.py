@@ -21,7 +21,7 @@ import numpy as np
 import tyro
 from another_day import HEIGHT_M, STAND_M, Kind, SetDown, bruise_cm2, dried_materials, fruit_of, set_down
 from change_over_time import AGAIN, GROWN, MESH, NEAR_M, SESSION_SD, beside
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from results_table import RESULTS, write_results
 from rich.progress import track
 from scipy.spatial import cKDTree
@@ -80,7 +80,7 @@ class ChangeOfRuns:
         )
 
     def _rows(self, fruit: int) -> list[list[str]]:
-        first, *later = self._days(fruit)
+        first, *later = self.days_of(fruit)
         indices, rows = find_indices((), first.surface.wavelengths_nm), []
         # Without --repeat, that capture of the first day is a day as well.
         for given in (None, *(day for day in later if day.name == REPEAT)):
@@ -93,7 +93,8 @@ class ChangeOfRuns:
             rows.append(self._row(fruit, one, None, AFTER_REPEAT))
         return rows
 
-    def _days(self, fruit: int) -> list[Day]:
+    def days_of(self, fruit: int) -> list[Day]:
+        """The days of a fruit on the first one's mesh, trained if they are not kept."""
         kept = self.folder / f"days-{fruit}.pkl"
         if not kept.is_file():
             clouds = [self._cloud(fruit, name) for name in self.days]
@@ -118,10 +119,7 @@ class ChangeOfRuns:
             if brightness.counted:
                 by_brightness = beside(1e4 * brightness.regions[0].area_m2, true_cm2)
         surface = one.after.surface
-        # A simulated session has its object on the axis.
-        placed = set_down(DAYS["first"], before.mesh.vertices)(before.mesh.vertices)
-        centre = (placed.min(axis=0) + placed.max(axis=0)) / 2.0
-        placed += [-centre[0], -centre[1], STAND_M - placed[:, 2].min()]
+        placed = on_the_table(before)
         bruise = before.materials.index("bruise")
         differs = np.abs(after.weights[:, bruise] - before.weights[:, bruise]) > 0.02
         far = np.ones(len(surface.mesh.vertices), bool)
@@ -176,6 +174,13 @@ class ChangeOfRuns:
             if not left.exists():
                 run_step(name, typed_command(words), folder / f"{name}.log")
         return read_spectral_ply(cloud).select(slice(None, None, EVERY))
+
+
+def on_the_table(fruit: TrueObject) -> Float[np.ndarray, "v 3"]:
+    """Vertices of a fruit on its first day: a simulated session has its object on the axis."""
+    placed = set_down(DAYS["first"], fruit.mesh.vertices)(fruit.mesh.vertices)
+    centre = (placed.min(axis=0) + placed.max(axis=0)) / 2.0
+    return placed + np.array([-centre[0], -centre[1], STAND_M - placed[:, 2].min()])
 
 
 def _undecided_cm2(one: Comparison, far: Bool[np.ndarray, "v"]) -> dict[str, float]:
