@@ -51,8 +51,10 @@ DAYS = {
     SECOND: SetDown(AGAIN, turn_deg=200.0, tip_deg=4.0),
     "grown, 10 % dried": SetDown(GROWN, dried=0.1, turn_deg=30.0, tip_deg=3.0),
 }
-COLUMNS = ("fruit", "day", "second capture of the first day", "turn, °", "turn found, °", "bruise grew, cm²")
-COLUMNS += ("by brightness, cm²", "false change, cm²", "largest undecided, cm²", "in quantities")
+COLUMNS = (
+    *("fruit", "day", "second capture of the first day", "turn, °", "turn found, °", "bruise grew, cm²"),
+    *("by brightness, cm²", "false change, cm²", "largest undecided, cm²", "in quantities"),
+)
 AFTER_REPEAT = f"{REPEAT}, then second capture"
 """Another pair of captures of the first day."""
 
