@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 import trimesh
+from results_table import RESULTS, read_results
 
 from hsi_sc_nerf.analysis.change import compare_days
 from hsi_sc_nerf.analysis.change_days import Day
@@ -137,3 +138,31 @@ def test_undecided_regions_are_striped_in_the_picture(first, alone, tmp_path, mo
     draw_change(tmp_path / "brightness.png", first, one, one.quantities["brightness"], views)
     assert striped[:3] == [None] * 3
     assert np.array_equal(striped[3], one.quantities["brightness"].undecided)
+
+
+def blanks(*fruits):
+    """Rows of the table for pairs of captures of one day, without a repeat."""
+    titles, *rows = read_results(RESULTS / "change_of_runs.csv")
+    table = [dict(zip(titles, row, strict=True)) for row in rows]
+    return [
+        row
+        for row in table
+        if row["fruit"] in {f"apple {fruit}" for fruit in fruits}
+        and row["second capture of the first day"] == "no"
+        and row["bruise grew, cm²"] == ""
+    ]
+
+
+def test_the_limit_follows_from_the_blanks_of_four_apples():
+    largest = np.array([float(row["largest undecided, cm²"]) for row in blanks(3, 4, 5, 6)])
+    some = largest[largest > 0.0]
+    limit_m2 = 1e-4 * some.mean() * np.log(len(some) / len(largest) / 0.01)
+    assert len(largest) == 12
+    assert pytest.approx(limit_m2, rel=0.02) == LIMIT_M2
+    assert pytest.approx(limit_m2 / 0.0162, rel=0.02) == LIMIT_PART
+
+
+def test_on_three_other_apples_no_blank_shows_a_change():
+    others = blanks(7, 8, 9)
+    assert len(others) == 9
+    assert {row["false change, cm²"] for row in others} == {"0.00"}
