@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +17,9 @@ from hsi_sc_nerf.simulate.materials import MATERIALS, Material, PlantTissue, end
 from hsi_sc_nerf.simulate.plants import FRUIT_MATERIALS, apple, fruit_weights, pear
 from hsi_sc_nerf.simulate.scene import Fruit
 
+Kind: TypeAlias = Literal["apple", "pear"]
+HEIGHT_M = 0.075
+"""Of a fruit with its stem."""
 STAND_M = 0.07
 """Height of the container."""
 BASE_M = 0.006
@@ -74,11 +77,17 @@ class CloudErrors:
 
 
 def fruit_of(
-    day: SetDown, wavelengths_nm: Float[np.ndarray, "bands"], kind: Literal["apple", "pear"] = "apple", seed: int = 3
+    day: SetDown,
+    wavelengths_nm: Float[np.ndarray, "bands"],
+    kind: Kind = "apple",
+    seed: int = 3,
+    height_m: float = HEIGHT_M,
 ) -> TrueObject:
     """The true surface of an apple or a pear on that day, as it grew, not turned."""
     rng = np.random.default_rng(seed)
-    fruit = Fruit(kind, height_m=0.075, blush=0.8, lenticel_diameter_m=0.002, bruise_diameter_m=day.bruise_diameter_m)
+    fruit = Fruit(
+        kind, height_m=height_m, blush=0.8, lenticel_diameter_m=0.002, bruise_diameter_m=day.bruise_diameter_m
+    )
     shape = (apple if kind == "apple" else pear)(fruit.height_m, rng)
     weights = fruit_weights(shape, fruit, rng)
     spectra = endmembers(FRUIT_MATERIALS[kind], wavelengths_nm, dried_materials(day, kind))
@@ -91,7 +100,7 @@ def bruise_cm2(fruit: TrueObject) -> float:
     return float(1e4 * fruit.mesh.vertex_areas_m2()[bruised].sum())
 
 
-def dried_materials(day: SetDown, kind: Literal["apple", "pear"]) -> dict[str, Material]:
+def dried_materials(day: SetDown, kind: Kind) -> dict[str, Material]:
     """The fruit's tissues with the water that they have left on that day, by name."""
     return {
         name: replace(tissue, water=tissue.water * (1.0 - day.dried))

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import tyro
-from another_day import CloudErrors, SetDown, bruise_cm2, cloud_of, fruit_of, set_down
+from another_day import CloudErrors, Kind, SetDown, bruise_cm2, cloud_of, fruit_of, set_down
 from results_table import RESULTS, write_results
 from rich.progress import track
 from scipy.spatial import cKDTree
@@ -52,7 +52,6 @@ COLUMNS = (
 FIRST = SetDown(AGAIN)
 NEAR_M = 0.004
 """As far from what changed a pixel or a patch may call a change."""
-Kind: TypeAlias = Literal["apple", "pear"]
 Row: TypeAlias = tuple[str, SetDown, CloudErrors]
 """Name, day and errors."""
 ROUGH = {

@@ -11,10 +11,11 @@ from jaxtyping import Bool, Float
 
 from hsi_sc_nerf.analysis.change_days import Day
 from hsi_sc_nerf.analysis.change_maps import BRIGHTNESS, SPECTRUM, Quantity, changes
-from hsi_sc_nerf.analysis.change_regions import GrownRegion, grown_regions
+from hsi_sc_nerf.analysis.change_regions import GrownRegion, connected_to, grown_regions
 from hsi_sc_nerf.analysis.change_significance import FALSE_DISCOVERIES
 from hsi_sc_nerf.analysis.library import SpectralLibrary
 from hsi_sc_nerf.analysis.traits import Classes, classified
+from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.indices.formula import SpectralIndex
 
 
@@ -74,15 +75,22 @@ def compare_days(
         classes = {}
         if library is not None and at_first is not None:
             now = classified(after.surface, library, angle_rad)
-            classes = _class_regions(first, at_first, now, _beyond_noise(quantities), areas_m2)
+            classes = _class_regions(first, at_first, now, _beyond_noise(quantities, mesh), areas_m2)
         yield Comparison(first.name, after, quantities, before.name, grown, classes)
         earlier = quantities
 
 
-def _beyond_noise(quantities: Mapping[str, Quantity]) -> Bool[np.ndarray, "v"]:
-    """Where the spectrum or its brightness changed; elsewhere another class is noise at the edge of two."""
-    told = [quantities[name] for name in (SPECTRUM, BRIGHTNESS) if name in quantities]
-    return np.any([one.changed | (one.p < FALSE_DISCOVERIES) for one in told], axis=0)
+def _beyond_noise(quantities: Mapping[str, Quantity], mesh: Mesh) -> Bool[np.ndarray, "v"]:
+    """Where the spectrum or its brightness changed; elsewhere another class is noise at the edge of two.
+
+    Significant patches beside the regions count as well; without a repeat, only those that touch one.
+    """
+    beyond = np.zeros(len(mesh.vertices), bool)
+    for name in {SPECTRUM, BRIGHTNESS} & set(quantities):
+        one = quantities[name]
+        told = one.changed | (one.p < FALSE_DISCOVERIES)
+        beyond[connected_to(mesh, told, one.changed) if one.limit_m2 else told] = True
+    return beyond
 
 
 def _class_regions(

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.analysis.change_days import Day
 from hsi_sc_nerf.analysis.change_features import COMPONENTS, surface_gradients, unit_spectra
+from hsi_sc_nerf.analysis.change_limit import limit_of_blank_m2
 from hsi_sc_nerf.analysis.change_regions import OUTSIDE, ChangedRegion, changed_regions
 from hsi_sc_nerf.analysis.change_significance import (
     FALSE_DISCOVERIES,
@@ -43,7 +44,8 @@ class Quantity:
         p: adjusted for false discoveries, of the patch of each vertex; 1 where it is not known.
         test: of the patches and of the whole surface.
         region: number of each vertex's region, -1 outside.
-        regions: areas that changed beyond noise, and otherwise than the whole surface.
+        regions: areas that changed beyond noise, and otherwise than the whole surface, the largest first.
+        limit_m2: regions up to this area are undecided (`hsi_sc_nerf.analysis.change_limit`); 0 with a repeat.
     """
 
     name: str
@@ -53,11 +55,22 @@ class Quantity:
     test: Significance
     region: Int[np.ndarray, "v"]
     regions: list[ChangedRegion]
+    limit_m2: float = 0.0
+
+    @property
+    def counted(self) -> int:
+        """How many regions, the first ones, are larger than the limit."""
+        return sum(one.area_m2 > self.limit_m2 for one in self.regions)
 
     @property
     def changed(self) -> Bool[np.ndarray, "v"]:
-        """Which vertices lie in a region."""
-        return self.region != OUTSIDE
+        """Which vertices lie in a region that counts."""
+        return (self.region != OUTSIDE) & (self.region < self.counted)
+
+    @property
+    def undecided(self) -> Bool[np.ndarray, "v"]:
+        """Which vertices lie in a region that is no larger than the limit."""
+        return self.region >= self.counted
 
     @property
     def whole(self) -> tuple[float, float]:
@@ -85,7 +98,7 @@ def changes(
         session_sd: relative standard deviation of the reflectance that the white references of two sessions make
             alike for the whole surface, as a level and as a slope over the bands.
         repeat: another capture of the day before, on the same mesh. What is no larger than between these two is no
-            change.
+            change. Without it, regions up to the limit of blank are undecided.
 
     Raises:
         InputError: too little of the surface is seen on both days, a wavelength has no band near it, or an index has
@@ -112,6 +125,7 @@ def changes(
         _scalars(x, one.wavelengths_nm, bands_nm, indices) for x in (typical, *(typical * (1.0 + m) for m in modes))
     )
     quantities = (len(one.wavelengths_nm) > 1) + len(usual) + 1  # spectrum, scalars, surface
+    limit_m2 = limit_of_blank_m2(float(one.areas_m2[seen].sum())) if repeat is None else 0.0
 
     def tested(
         name: str,
@@ -132,7 +146,7 @@ def changes(
         beyond, significant = last - first - test.whole, test.p < FALSE_DISCOVERIES
         region, regions = changed_regions(one.mesh, one.areas_m2, patches, first, beyond, significant, test.noise)
         change = (last - first)[:, 0] if shown is None else np.where(seen, shown, np.nan)
-        return Quantity(name, unit, change, p, test, region, regions)
+        return Quantity(name, unit, change, p, test, region, regions, limit_m2)
 
     found: dict[str, Quantity] = {}
     if len(one.wavelengths_nm) > 1:

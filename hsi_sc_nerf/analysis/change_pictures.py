@@ -7,7 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from matplotlib import colormaps, rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -29,18 +29,21 @@ _BOTH_WAYS = "RdBu_r"
 
 @rc_context(STYLE)
 def draw_change(path: Path, first: Day, one: Comparison, quantity: Quantity, views: SideViews) -> None:
-    """A quantity on the four sides: before, after, its change, and the p-values; grey is not seen on both days."""
+    """A quantity on the four sides: before, after, its change, and the p-values; grey is not seen on both days.
+
+    Regions up to the limit of blank are striped.
+    """
     colours, low, high, name = _scale(quantity)
     p = -np.log10(np.clip(quantity.p, _SMALLEST_P, 1.0))
     lit = colormaps[INDEX_COLOURS](p / -np.log10(_SMALLEST_P))[:, :3]
     lit[~quantity.changed] *= 0.6
+    undecided = quantity.undecided
+    tested = "p-value, -log10\noutlined areas lit" + ("\nundecided striped" if undecided.any() else "")
     rows = {
         "before": views.on_white(_natural(first, first)),
         "after": views.on_white(_natural(one.after, first)),
         f"{quantity.name}\nchange ({quantity.unit})": views.on_white(colours(quantity.change)),
-        "p-value, -log10\noutlined areas lit": views.on_white(
-            np.where(np.isfinite(quantity.change)[:, None], lit, GREY)
-        ),
+        tested: views.on_white(np.where(np.isfinite(quantity.change)[:, None], lit, GREY), undecided),
     }
     draw_rows(path, rows, (None, None, (low, high, name), (0.0, -np.log10(_SMALLEST_P), INDEX_COLOURS)))
 
@@ -65,7 +68,7 @@ def write_film(path: Path, first: Day, comparisons: Sequence[Comparison], views:
         lit = np.where(
             changed.p < FALSE_DISCOVERIES, changed.change, np.where(np.isfinite(changed.change), 0.0, np.nan)
         )
-        stills.append(_frame(one.after.name, one.after, first, colours(lit), views, shown))
+        stills.append(_frame(one.after.name, one.after, first, colours(lit), views, shown, changed.undecided))
     with atomic_write(path) as (temporary,), open_video(temporary, _FRAMES_PER_SECOND) as add_frame:
         for before, after in pairwise([*stills, stills[-1]]):
             for _ in range(_HELD_FRAMES):
@@ -75,7 +78,13 @@ def write_film(path: Path, first: Day, comparisons: Sequence[Comparison], views:
 
 
 def _frame(
-    name: str, day: Day, first: Day, change: Float[np.ndarray, "v 3"], views: SideViews, shown: str
+    name: str,
+    day: Day,
+    first: Day,
+    change: Float[np.ndarray, "v 3"],
+    views: SideViews,
+    shown: str,
+    undecided: Bool[np.ndarray, "v"] | None = None,
 ) -> UInt8[np.ndarray, "h w 3"]:
     figure = new_figure(7.5, 4.2)
     figure.suptitle(name)
@@ -83,7 +92,7 @@ def _frame(
     for line, label, pictures in zip(
         grid,
         ("pseudo-RGB", f"{shown}\nsince {first.name}"),
-        map(views.on_white, (_natural(day, first), change)),
+        (views.on_white(_natural(day, first)), views.on_white(change, undecided)),
         strict=True,
     ):
         for axes, picture in zip(line, pictures, strict=True):

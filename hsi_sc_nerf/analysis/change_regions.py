@@ -111,7 +111,7 @@ def changed_regions(
         )
         half = np.clip(contrast, plateau, _MOST_CONTRAST * plateau) / 2.0
         blur = float(np.linalg.norm(noise * direction))
-        inside, less, more = (_connected(mesh, along > level, core) for level in (half, half + blur, half - blur))
+        inside, less, more = (connected_to(mesh, along > level, core) for level in (half, half + blur, half - blur))
         return inside, float(areas_m2[more].sum() - areas_m2[less].sum()) / 2.0
 
     labels = np.full(len(known), OUTSIDE)
@@ -182,6 +182,12 @@ def grown_regions(
     )
 
 
+def connected_to(mesh: Mesh, inside: Bool[np.ndarray, "v"], core: Bool[np.ndarray, "v"]) -> Int[np.ndarray, "inside"]:
+    """The pieces of a part of the surface that reach into its core."""
+    kept = [piece for piece in _pieces(mesh, inside) if core[piece].any()]
+    return np.concatenate(kept) if kept else np.zeros(0, int)
+
+
 def _touching(
     patches: Patches, change: Float[np.ndarray, "p k"], significant: Bool[np.ndarray, "p"]
 ) -> list[Int[np.ndarray, "group"]]:
@@ -194,12 +200,6 @@ def _touching(
     linked = csr_array((np.ones(len(start)), (start, end)), shape=(len(some),) * 2)
     count, group = connected_components(linked, directed=False)
     return [some[group == number] for number in range(count)]
-
-
-def _connected(mesh: Mesh, inside: Bool[np.ndarray, "v"], core: Bool[np.ndarray, "v"]) -> Int[np.ndarray, "inside"]:
-    """The pieces of a part of the surface that reach into its core."""
-    kept = [piece for piece in _pieces(mesh, inside) if core[piece].any()]
-    return np.concatenate(kept) if kept else np.zeros(0, int)
 
 
 def _pieces(mesh: Mesh, inside: Bool[np.ndarray, "v"]) -> list[Int[np.ndarray, "piece"]]:

@@ -25,13 +25,16 @@ COLUMNS = (
 )
 """Of change.csv."""
 WHOLE = "whole surface"
+CHANGED, UNDECIDED = "change", "undecided"
+"""Kinds of rows: regions that count, and those up to the limit of blank."""
 _CM2_PER_M2 = 1e4
 _PAGE_REGIONS = 12
 
 
 def change_rows(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
-    """The rows of change.csv: of each quantity the whole surface and its regions, areas grown since the day before,
-    and regions of classes that changed. Absent numbers are None."""
+    """The rows of change.csv: of each quantity the whole surface and its regions, those up to the limit of blank as a
+    kind of their own; areas grown since the day before, and regions of classes that changed. Absent numbers are None.
+    """
     rows: list[dict[str, Any]] = []
     for one in comparisons:
         areas_m2 = one.after.surface.areas_m2
@@ -40,7 +43,7 @@ def change_rows(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
             change, sd = quantity.whole
             changed_m2 = float(areas_m2[quantity.changed].sum())
             whole = {"region": WHOLE, "change": change, "change_sd": sd, "p": quantity.test.whole_p}
-            rows.append(head | {"kind": "change", **whole, **_areas(0.0, changed_m2)})
+            rows.append(head | {"kind": CHANGED, **whole, **_areas(0.0, changed_m2)})
             for number, region in enumerate(quantity.regions):
                 inside = quantity.region == number
                 mean = float(np.average(quantity.change[inside], weights=areas_m2[inside]))
@@ -50,7 +53,7 @@ def change_rows(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
                 told |= _areas(0.0, region.area_m2, region.centre_m) | {
                     "area_change_sd_cm2": _CM2_PER_M2 * region.area_sd_m2
                 }
-                rows.append(head | {"kind": "change"} | told)
+                rows.append(head | {"kind": CHANGED if number < quantity.counted else UNDECIDED} | told)
         # Beside the first day, the regions themselves are what grew.
         grown = one.grown if one.earlier != one.before else {}
         for kind, before, groups in (("grown", one.earlier, grown), ("class", one.before, one.classes)):
@@ -98,7 +101,8 @@ def write_tables(
         writer.writerow(COLUMNS)
         writer.writerows([_cell(row[column]) for column in COLUMNS] for row in rows)
     parts = ["# Change over time", *_set_down(comparisons, repeat)]
-    parts += ["## What changed", *_table([row for row in rows if row["kind"] == "change"])]
+    parts += ["## What changed", *_table([row for row in rows if row["kind"] == CHANGED])]
+    parts += _undecided(comparisons, [row for row in rows if row["kind"] == UNDECIDED])
     for kind, heading in (("grown", "Areas since the day before"), ("class", "Areas of classes")):
         if some := [row for row in rows if row["kind"] == kind]:
             parts += [f"## {heading}", *_table(some)]
@@ -126,7 +130,7 @@ def _content(
             }
             for name, quantity in one.quantities.items()
         }
-        days.append(_placed(one.after) | {"noise": noise})
+        days.append(_placed(one.after) | {"limit_of_blank_m2": _limit_m2(one) or None, "noise": noise})
     return {
         "settings": dict(settings),
         "first_day": comparisons[0].before,
@@ -164,6 +168,27 @@ def _set_down(comparisons: Sequence[Comparison], repeat: Day | None) -> list[str
     return ["## How the object was set down", markdown_table([*header, "next best attitude"], rows), note]
 
 
+def _undecided(comparisons: Sequence[Comparison], rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What the limit of blank is and which regions are below it; nothing with a repeat."""
+    limit_m2 = max(_limit_m2(one) for one in comparisons)
+    if limit_m2 == 0.0:
+        return []
+    told = (
+        f"Two captures of one day show regions of up to {_CM2_PER_M2 * limit_m2:.2g} cm² that are no change (limit "
+        "of blank). "
+    )
+    if not rows:
+        return [told + "No region here is as small."]
+    told += (
+        "Those of this table are no larger and are not counted; a second capture of the first day (--repeat) decides."
+    )
+    return ["## Undecided: below the limit of blank", told, *_table(rows)]
+
+
+def _limit_m2(one: Comparison) -> float:
+    return max(quantity.limit_m2 for quantity in one.quantities.values())
+
+
 def _table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     columns = [name for name in COLUMNS[:13] if name != "kind" and any(row[name] is not None for row in rows)]
     listed = [row for row in rows if row["region"] == WHOLE or int(row["region"]) <= _PAGE_REGIONS]
@@ -183,8 +208,9 @@ def _cell(value: Any, numbers: str = ".6g") -> str:
 def write_change_ply(path: Path, first: Day, comparisons: Sequence[Comparison]) -> None:
     """The first day's mesh and spectra; of each later day change, p-value and region of each quantity.
 
-    Columns are named ``QUANTITY_KIND_DAY``: ``ndvi_change_1``, ``ndvi_p_1`` and ``ndvi_region_1`` (0 outside) of the
-    second cloud. The surface's change is in metres, as all lengths of the file.
+    Columns are named ``QUANTITY_KIND_DAY``: ``ndvi_change_1``, ``ndvi_p_1`` and ``ndvi_region_1`` of the second
+    cloud. A region's number is 0 outside and negative if it is undecided. The surface's change is in metres, as all
+    lengths of the file.
     """
     extra = {}
     for day, one in enumerate(comparisons, start=1):
@@ -192,5 +218,5 @@ def write_change_ply(path: Path, first: Day, comparisons: Sequence[Comparison]) 
             word = re.sub(r"\W+", "_", name.lower())
             extra[f"{word}_change_{day}"] = quantity.change * (1e-3 if name == SURFACE else 1.0)
             extra[f"{word}_p_{day}"] = quantity.p
-            extra[f"{word}_region_{day}"] = quantity.region + 1.0
+            extra[f"{word}_region_{day}"] = np.where(quantity.undecided, -1.0, 1.0) * (quantity.region + 1.0)
     write_mesh(path, first.surface, {name: column.astype(np.float32) for name, column in extra.items()})
