@@ -181,11 +181,11 @@ def _hull(
         )
         return [Finding("masks-hull", "red", sentence, {"contradiction": typical})]
     excess = MAX_ODDITY + 0.125 * pixel
-    odd, contradiction = _odd(masks, silhouettes, brightness, filled, excess)
+    odd, contradiction = _odd(masks, silhouettes, brightness, excess)
     if not odd.any():
         return []
     # The outermost frames of a part of a turn carve alone and are outvoted, but the core agrees with all masks.
-    odd_to_core, to_core = _odd(masks, hull.core_silhouettes, brightness, filled, excess)
+    odd_to_core, to_core = _odd(masks, hull.core_silhouettes, brightness, excess)
     if not odd_to_core.any() and np.median(to_core[filled]) <= typical:
         return []
     others = {name: float(c) for name, c, is_odd in zip(names, contradiction, odd, strict=True) if is_odd}
@@ -200,10 +200,10 @@ def _odd(
     masks: Bool[np.ndarray, "frames h w"],
     silhouettes: Bool[np.ndarray, "frames h w"],
     brightness: Float[np.ndarray, "frames h w"],
-    filled: Bool[np.ndarray, "frames"],
     excess: float,
 ) -> tuple[Bool[np.ndarray, "frames"], Float[np.ndarray, "frames"]]:
     """Which masks differ by ``excess`` more from their silhouettes than a typical one, and by how much all differ."""
+    filled = masks.any(axis=(1, 2))
     differences = _contradiction(masks, silhouettes)[filled]
     scatter = float(median_abs_deviation(differences, scale="normal"))
     contradiction = _contradiction(masks & ~_background(masks, silhouettes, brightness), silhouettes)
