@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,12 +11,21 @@ from hsi_sc_nerf.analysis import pictures, report
 from hsi_sc_nerf.analysis.library import write_library
 from hsi_sc_nerf.analysis.measurement import Measurement
 from hsi_sc_nerf.analysis.spectral_mesh import write_mesh
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.spectra import available_composites
+
+_PICTURES = (
+    *("classes.png", "classes_by_mixture.png", "calibration_*.png", "region_spectra.png", "composites.png"),
+    *("indices.png", "calibrations.png", "components.png", "endmembers.png"),
+)
+_TABLES = ("traits.md", "traits.json", "spectra.csv", "regions.sli", "regions.hdr", "mesh.ply")
 
 
 def write_measurement(folder: Path | str, measured: Measurement, name: str) -> dict[str, Any]:
     """Write pictures, mesh and tables, and last ``traits.md``, the page that links them.
+
+    Pictures of an earlier result in the same folder that this one does not have are deleted.
 
     Args:
         folder: to write to.
@@ -74,4 +84,29 @@ def write_measurement(folder: Path | str, measured: Measurement, name: str) -> d
     content = replace(measured, settings={"cloud": name, **measured.settings}).content()
     write_json(folder / "traits.json", content)
     report.write_page(folder / "traits.md", name, content, drawn)
+    delete_earlier(folder, keep=(*_TABLES, *drawn.values()))
     return content
+
+
+def delete_earlier(folder: Path, keep: Collection[str] = ()) -> None:
+    """Delete the files of `write_measurement` in a folder, and the folder, if nothing else is in it.
+
+    ``endmembers.csv`` stays, as do proposed regions: both may be what a command was given.
+
+    Args:
+        folder: that an earlier result may lie in.
+        keep: names of files that belong to the present one.
+
+    Raises:
+        InputError: a file cannot be deleted.
+    """
+    try:
+        for path in [path for name in (*_PICTURES, *_TABLES) for path in folder.glob(name) if path.name not in keep]:
+            path.unlink()
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
+    except OSError as error:
+        raise InputError(
+            f"{error.filename}: is of an earlier result and cannot be deleted ({error.strerror}); delete it, or choose "
+            "another folder."
+        ) from error
