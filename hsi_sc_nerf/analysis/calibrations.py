@@ -188,6 +188,7 @@ def calibration_map(surface: SpectralMesh, calibration: Calibration) -> SurfaceM
         calibration.error,
         unit=calibration.unit,
         resampling_error=resampling_error,
+        limited=calibration.domain is not None,
     )
 
 
