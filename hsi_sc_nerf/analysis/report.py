@@ -225,6 +225,8 @@ def _outside(value: Mapping[str, Any], calibration: Mapping[str, Any]) -> str:
 
 
 def _map_mean(value: Mapping[str, float | None]) -> str:
+    if value["mean"] is None:
+        return "no value"
     std = value.get("std")
     return _with_sd(value["mean"], value["sd"], digits=3) + ("" if std is None else f" ({std:.2g})")
 
@@ -305,9 +307,10 @@ def _plain_reflectance(region: RegionTraits) -> dict[str, float | None]:
     return {name: float(value) if np.isfinite(value) else None for name, value in values.items()}
 
 
-def _bounds(one: SurfaceMap | ClassMap) -> dict[str, float | bool]:
-    """How well a calibration fits the surface's bands and spectra."""
-    return {"resampling_error": one.resampling_error, "limits": one.limited}
+def _bounds(one: SurfaceMap | ClassMap) -> dict[str, float | bool | None]:
+    """How well a calibration fits the surface's bands and spectra; no error where no spectrum has a value."""
+    error = one.resampling_error
+    return {"resampling_error": error if math.isfinite(error) else None, "limits": one.limited}
 
 
 def _plain_areas(names: Sequence[str], found: ClassAreas, relative_sd: float) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Calibrations against scikit-learn's regressions, on simulated spectra."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -115,6 +116,17 @@ def test_the_table_says_where_no_limits_are_stated(fitted):
         content = trait_content(size_of(surface.mesh), {}, True, traits, {})
         shown += [row[-1] for one in trait_tables(content) if one.heading == "Calibrations" for row in one.rows]
     assert shown == ["4.0%", "0.0% (no limits stated)"]
+
+
+def test_a_surface_that_the_calibration_does_not_know_has_no_value_in_the_table_and_null_in_json(fitted):
+    strange = simulated(20)[0] + 0.1 * np.exp(-(((NM - 500) / 10) ** 2))
+    surface = surface_of(strange[:, ::2], NM[::2])
+    traits = analyse(surface, maps=[calibration_map(surface, read_calibration(fitted))])
+    content = trait_content(size_of(surface.mesh), {}, True, traits, {})
+    json.dumps(content["calibrations"], allow_nan=False)
+    (shown,) = (one for one in trait_tables(content) if one.heading == "Calibrations")
+    assert [row[-2:] for row in shown.rows] == [["no value", "100.0%"]]
+    assert "nan" not in shown.note
 
 
 def test_a_map_of_the_same_bands_is_not_resampled(fitted):

@@ -162,7 +162,9 @@ def test_an_onnx_classifier_on_the_page_in_the_tables_and_in_the_mesh(tmp_path):
         np.testing.assert_allclose(list(areas["area_sds_m2"].values()), np.hypot(bare.stds_m2, shared))
     (rows,) = (one.rows for one in trait_tables(content) if one.heading == "Classifiers")
     assert [row[:3] for row in rows] == [
-        [region, "ripe", label] for region in ("whole surface", "side") for label in ("unripe", "ripe", WITHOUT_LIMITS)
+        [region, "ripe", label]
+        for region in ("whole surface", "side")
+        for label in ("unripe", "ripe", WITHOUT_LIMITS)
     ]
     assert all("±" in row[3] for row in rows if row[2] != WITHOUT_LIMITS)
 
