@@ -85,7 +85,7 @@ def write_measurement(folder: Path | str, measured: Measurement, name: str) -> d
             pictures.draw_maps(folder / picture, of_picture, surface, views)
             drawn[caption] = picture
     write_mesh(folder / "mesh.ply", surface, extra)
-    _write_spectra(folder / "spectra.csv", surface.wavelengths_nm, traits)
+    write_spectra(folder / "spectra.csv", surface.wavelengths_nm, traits)
     write_library(folder / "regions.sli", measured.region_spectra())
     content = replace(measured, settings={"cloud": name, **measured.settings}).content()
     write_json(folder / "traits.json", content)
@@ -118,7 +118,7 @@ def delete_earlier(folder: Path, keep: Collection[str] = ()) -> None:
         ) from error
 
 
-def _write_spectra(path: Path, wavelengths_nm: Float[np.ndarray, "bands"], traits: Traits) -> None:
+def write_spectra(path: Path, wavelengths_nm: Float[np.ndarray, "bands"], traits: Traits) -> None:
     """``spectra.csv``: a line a band; of each region the mean and the standard deviation over its surface.
 
     Where material and light are told apart, both the material's and those as measured.
