@@ -188,6 +188,7 @@ def calibration_map(surface: SpectralMesh, calibration: Calibration) -> SurfaceM
         calibration.error,
         unit=calibration.unit,
         resampling_error=resampling_error,
+        limited=calibration.domain is not None,
     )
 
 
@@ -223,7 +224,9 @@ def read_calibration(path: Path | str) -> Calibration:
         classes = tuple(word.strip() for word in re.split("[,;]", head.get("classes", "")) if word.strip())
         if classes and (len(classes) < 2 or len(set(classes)) < len(classes) or "model" not in head):
             raise ValueError("classes needs two names or more, each once, and a model that gives their probabilities")
-    except (ValueError, OSError) as error:
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); {_REMEDY}.") from error
+    except ValueError as error:
         raise InputError(f"{path}: is no table of a calibration ({error}); {_REMEDY}.") from error
     if "model" in head:
         predict = _onnx_model(path, head["model"], int(used.sum()), slice(column, column + max(1, len(classes))))

@@ -16,6 +16,8 @@ from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 
 OUTSIDE = "outside of what the classifier knows"
 """Words for surface whose spectra it was not fitted on, which no class has as its name."""
+WITHOUT_LIMITS = "no class (the classifier's table states no limits)"
+"""Words for surface without a value where nothing tells which spectra it was fitted on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +31,7 @@ class ClassMap:
             was fitted on.
         shaken: labels of the same spectra with one more draw of their noise; None where that is not known.
         resampling_error: fraction of the classified area whose class resampling the spectra changes.
+        limited: whether it tells which spectra it was fitted on.
     """
 
     name: str
@@ -36,6 +39,7 @@ class ClassMap:
     probabilities: Float[np.ndarray, "v classes"]
     shaken: Int[np.ndarray, "v"] | None = None
     resampling_error: float = 0.0
+    limited: bool = True
 
     @cached_property
     def labels(self) -> Int[np.ndarray, "v"]:
@@ -80,7 +84,8 @@ def class_map(surface: SpectralMesh, classifier: Calibration) -> ClassMap:
         shaken = np.full(len(seen), UNCLASSIFIED)
         shaken[seen] = most_probable(classifier.predictions(classifier.resampled(spectra + noise, nm)))
         shaken[np.isnan(probabilities[:, 0])] = UNCLASSIFIED
-    found = ClassMap(classifier.name, classifier.classes, probabilities, shaken)
+    limited = classifier.domain is not None
+    found = ClassMap(classifier.name, classifier.classes, probabilities, shaken, limited=limited)
     known, changed = found.labels[seen] != UNCLASSIFIED, 0.0
     if (coarse := classifier.coarser(nm)) is not None and known.any():
         other = most_probable(classifier.predictions(classifier.resampled(spectra[:, coarse], nm[coarse])))
@@ -119,6 +124,15 @@ def class_areas(
             doubt = doubt + weights @ moved / 2.0
         stds_m2 = np.sqrt(expected**2 + pixel_m**2 * doubt)
     return ClassAreas(areas_m2[:-1], stds_m2, float(areas_m2[-1]))
+
+
+def rest_words(limited: bool) -> str:
+    """Words for surface that a classifier gives no class.
+
+    Args:
+        limited: whether it tells which spectra it was fitted on.
+    """
+    return OUTSIDE if limited else WITHOUT_LIMITS
 
 
 def most_probable(probabilities: Float[np.ndarray, "n classes"]) -> Int[np.ndarray, "n"]:

@@ -32,6 +32,7 @@ class SurfaceMap:
         definition: words that find the index again; empty for other maps.
         unit: of the values; empty for none.
         resampling_error: root mean square of what resampling the spectra changes.
+        limited: of a calibration, whether it tells which spectra it was fitted on.
     """
 
     name: str
@@ -42,6 +43,7 @@ class SurfaceMap:
     definition: str = ""
     unit: str = ""
     resampling_error: float = 0.0
+    limited: bool = False
 
     @property
     def caption(self) -> str:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
 from hsi_sc_nerf.analysis.drawn_regions import DrawnRegion
 from hsi_sc_nerf.analysis.measurement import Measurement, measure_traits, on_container
-from hsi_sc_nerf.analysis.measurement_files import write_measurement
+from hsi_sc_nerf.analysis.measurement_files import delete_earlier, write_measurement
 from hsi_sc_nerf.analysis.report import PIECES, trait_tables
 from hsi_sc_nerf.analysis.standing_pieces import standing_pieces
 from hsi_sc_nerf.export.cloud import SpectralCloud
@@ -86,6 +86,7 @@ def write_pieces(folder: Path | str, pieces: Sequence[Measurement], name: str, p
     """Write the files of `write_measurement`: of one object into ``folder``, of several into piece-1, piece-2, ...
 
     Of several, ``traits.json`` in ``folder`` holds all; its ``traits.md`` compares their sizes and links their pages.
+    Files of an earlier result there, of another number of objects, are deleted.
 
     Args:
         folder: to write to.
@@ -99,6 +100,7 @@ def write_pieces(folder: Path | str, pieces: Sequence[Measurement], name: str, p
     folder = Path(folder)
     if len(pieces) == 1:
         write_measurement(folder, pieces[0], name if piece is None else f"{name}, piece {piece}")
+        _delete_pieces(folder, above=0)
         return
     contents = []
     for number, measured in enumerate(pieces, start=1):
@@ -111,6 +113,16 @@ def write_pieces(folder: Path | str, pieces: Sequence[Measurement], name: str, p
     write_json(folder / "traits.json", {PIECES: contents})
     with atomic_write(folder / "traits.md") as (temporary,):
         temporary.write_text(_page(contents, name), encoding="utf-8")
+    delete_earlier(folder, keep=("traits.json", "traits.md"))
+    _delete_pieces(folder, above=len(pieces))
+
+
+def _delete_pieces(folder: Path, above: int) -> None:
+    """What an earlier result wrote of pieces with a number above this one."""
+    for own in folder.glob("piece-*"):
+        number = own.name.removeprefix("piece-")
+        if number.isdecimal() and int(number) > above:
+            delete_earlier(own)
 
 
 def _page(contents: Sequence[Mapping[str, Any]], name: str) -> str:

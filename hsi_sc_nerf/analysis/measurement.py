@@ -30,6 +30,7 @@ from hsi_sc_nerf.analysis.size import (
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, with_spectra
 from hsi_sc_nerf.analysis.standing_pieces import one_piece
 from hsi_sc_nerf.analysis.traits import RegionOfInterest, Traits, analyse, classified
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, SpectralCloud
 from hsi_sc_nerf.indices.catalogue import find_indices
 from hsi_sc_nerf.packed.dataset import PackedDataset
@@ -113,6 +114,9 @@ def measure_traits(
         >>> found.size.volume_l, found.traits.regions[0].maps["PRI"].surface.mean
         (0.21, 0.04)
     """
+    names = [*(regions or ()), *(one.name for one in drawn_regions), *(set(library.names) if library else ())]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise InputError(f"two regions or classes are named {twice[0]}; give each region a name of its own.")
     config = on_container(MeshConfig() if mesh is None else mesh, dataset)
     cloud = one_piece(cloud, piece, config)
     picked = [RegionOfInterest(name, (x, y, z), radius) for name, (x, y, z, radius) in (regions or {}).items()]

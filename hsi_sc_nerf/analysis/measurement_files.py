@@ -2,20 +2,36 @@
 
 from __future__ import annotations
 
+import csv
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
 from hsi_sc_nerf.analysis import pictures, report
+from hsi_sc_nerf.analysis.class_maps import rest_words
 from hsi_sc_nerf.analysis.library import write_library
 from hsi_sc_nerf.analysis.measurement import Measurement
 from hsi_sc_nerf.analysis.spectral_mesh import write_mesh
-from hsi_sc_nerf.files import write_json
+from hsi_sc_nerf.analysis.traits import Traits
+from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import atomic_write, write_json
 from hsi_sc_nerf.spectra import available_composites
+
+_PICTURES = (
+    *("classes.png", "classes_by_mixture.png", "calibration_*.png", "region_spectra.png", "composites.png"),
+    *("indices.png", "calibrations.png", "components.png", "endmembers.png"),
+)
+_TABLES = ("traits.md", "traits.json", "spectra.csv", "regions.sli", "regions.hdr", "mesh.ply")
 
 
 def write_measurement(folder: Path | str, measured: Measurement, name: str) -> dict[str, Any]:
     """Write pictures, mesh and tables, and last ``traits.md``, the page that links them.
+
+    Pictures of an earlier result in the same folder that this one does not have are deleted.
 
     Args:
         folder: to write to.
@@ -44,7 +60,7 @@ def write_measurement(folder: Path | str, measured: Measurement, name: str) -> d
             drawn[caption], extra[column] = picture, labels.astype("float32")
     for one in traits.class_maps:
         picture = f"{one.column}.png"
-        pictures.draw_classes(folder / picture, one.classes, one.labels, surface, views, pictures.OUTSIDE)
+        pictures.draw_classes(folder / picture, one.classes, one.labels, surface, views, rest_words(one.limited))
         drawn[f"Classes by {one.name}"], extra[one.column] = picture, one.labels.astype("float32")
     drawn["Spectra of regions"] = "region_spectra.png"
     pictures.draw_region_spectra(folder / "region_spectra.png", surface.wavelengths_nm, traits)
@@ -69,9 +85,53 @@ def write_measurement(folder: Path | str, measured: Measurement, name: str) -> d
             pictures.draw_maps(folder / picture, of_picture, surface, views)
             drawn[caption] = picture
     write_mesh(folder / "mesh.ply", surface, extra)
-    report.write_spectra(folder / "spectra.csv", surface.wavelengths_nm, traits)
+    write_spectra(folder / "spectra.csv", surface.wavelengths_nm, traits)
     write_library(folder / "regions.sli", measured.region_spectra())
     content = replace(measured, settings={"cloud": name, **measured.settings}).content()
     write_json(folder / "traits.json", content)
     report.write_page(folder / "traits.md", name, content, drawn)
+    delete_earlier(folder, keep=(*_TABLES, *drawn.values()))
     return content
+
+
+def delete_earlier(folder: Path, keep: Collection[str] = ()) -> None:
+    """Delete the files of `write_measurement` in a folder, and the folder, if nothing else is in it.
+
+    ``endmembers.csv`` stays, as do proposed regions: both may be what a command was given.
+
+    Args:
+        folder: that an earlier result may lie in.
+        keep: names of files that belong to the present one.
+
+    Raises:
+        InputError: a file cannot be deleted.
+    """
+    try:
+        for path in [path for name in (*_PICTURES, *_TABLES) for path in folder.glob(name) if path.name not in keep]:
+            path.unlink()
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
+    except OSError as error:
+        raise InputError(
+            f"{error.filename}: is of an earlier result and cannot be deleted ({error.strerror}); delete it, "
+            "or choose another folder."
+        ) from error
+
+
+def write_spectra(path: Path, wavelengths_nm: Float[np.ndarray, "bands"], traits: Traits) -> None:
+    """``spectra.csv``: a line a band; of each region the mean and the standard deviation over its surface.
+
+    Where material and light are told apart, both the material's and those as measured.
+    """
+    titles, columns = [], []
+    for region in traits.regions:
+        kinds = {"": region.spectrum}
+        if region.light is not None:
+            kinds = {" material": region.spectrum, " measured": region.light.measured}
+        for kind, spectrum in kinds.items():
+            titles += [f"{region.name}{kind} mean", f"{region.name}{kind} SD"]
+            columns += [spectrum.mean, spectrum.sd]
+    with atomic_write(path) as (temporary,), temporary.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["wavelength_nm", *titles])
+        writer.writerows([f"{number:.6g}" for number in row] for row in zip(wavelengths_nm, *columns, strict=True))

@@ -12,7 +12,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, to_rgb
 from matplotlib.patches import Patch
 
-from hsi_sc_nerf.analysis.class_maps import OUTSIDE
+from hsi_sc_nerf.analysis.class_maps import OUTSIDE, WITHOUT_LIMITS
 from hsi_sc_nerf.analysis.classes import UNCLASSIFIED, class_areas_m2
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.analysis.traits import Traits
@@ -158,13 +158,14 @@ def draw_classes(
 ) -> None:
     """The classes on the surface, with their areas; grey is unseen.
 
-    Seen surface without a label is white if it is in no class, and striped if it is `OUTSIDE`.
+    Seen surface without a label is white if it is in no class, and striped if a classifier does not know it.
     """
+    striped = unlabelled in (OUTSIDE, WITHOUT_LIMITS)
     none = surface.seen & (labels == UNCLASSIFIED)
     colours = np.array([to_rgb(COLOURS[index % len(COLOURS)]) for index in range(len(names))])
     painted = np.where(labels[:, None] == UNCLASSIFIED, _NEAR_WHITE, colours[labels])
     painted[~surface.seen] = GREY
-    pictures = views.on_white(painted, none if unlabelled == OUTSIDE else None)
+    pictures = views.on_white(painted, none if striped else None)
     height, width = pictures[0].shape[:2]
     figure = new_figure(1.9 * len(SIDES_DEG), 1.9 * height / width + 0.3 + 0.22 * (len(names) // 3 + 2))
     for axes, picture, title in zip(figure.subplots(1, len(SIDES_DEG)), pictures, SIDES_DEG, strict=True):
@@ -178,7 +179,7 @@ def draw_classes(
     ]
     rest = f"{unlabelled}: {areas_cm2[-1]:.2f} cm²"
     white = Patch(facecolor=str(_NEAR_WHITE), edgecolor="0.5", label=rest)
-    patches += [_striped(rest) if unlabelled == OUTSIDE else white, Patch(color=str(GREY), label="not seen")]
+    patches += [_striped(rest) if striped else white, Patch(color=str(GREY), label="not seen")]
     figure.legend(handles=patches, loc="outside lower center", ncols=3, fontsize=8)
     save_figure(figure, path)
 

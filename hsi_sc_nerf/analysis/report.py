@@ -1,8 +1,7 @@
-"""Traits as JSON, as tables with units, as a page, and the regions' spectra as CSV."""
+"""Traits as JSON, as tables with units, and as a page."""
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
@@ -10,10 +9,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
-from hsi_sc_nerf.analysis.class_maps import OUTSIDE, ClassAreas
+from hsi_sc_nerf.analysis.class_maps import ClassAreas, ClassMap, rest_words
 from hsi_sc_nerf.analysis.components import Components
+from hsi_sc_nerf.analysis.maps import SurfaceMap
 from hsi_sc_nerf.analysis.size import Size, combined
 from hsi_sc_nerf.analysis.traits import WHOLE, MapMean, RegionTraits, Traits
 from hsi_sc_nerf.files import atomic_write
@@ -80,14 +79,11 @@ def trait_content(
         "seen_area_m2": traits.seen_m2,
         "indices": [one.definition for one in traits.maps if one.definition],
         "calibrations": {
-            one.name: {"unit": one.unit, "error": one.error, "resampling_error": one.resampling_error}
+            one.name: {"unit": one.unit, "error": one.error} | _bounds(one)
             for one in traits.maps
             if not one.definition
         },
-        "classifiers": {
-            one.name: {"classes": list(one.classes), "resampling_error": one.resampling_error}
-            for one in traits.class_maps
-        },
+        "classifiers": {one.name: {"classes": list(one.classes)} | _bounds(one) for one in traits.class_maps},
         "classes": None
         if classes is None
         else {
@@ -183,11 +179,14 @@ def trait_tables(content: Mapping[str, Any]) -> list[TraitTable]:
 
 def _calibration_table(calibrations: Mapping[str, Any], regions: Mapping[str, Any]) -> TraitTable:
     rows = [
-        [region, name, calibrations[name]["unit"], _map_mean(value), f"{value['outside']:.1%}"]
+        [region, name, calibrations[name]["unit"], _map_mean(value), _outside(value, calibrations[name])]
         for region, values in regions.items()
         for name, value in values["calibrations"].items()
     ]
-    note = f"{_MAP_NOTE} It counts the calibration's own error. Outside: area whose spectra it does not know."
+    note = (
+        f"{_MAP_NOTE} It counts the calibration's own error. Outside: area whose spectra it does not know, if "
+        "its table states limits."
+    )
     for name, of in calibrations.items():
         if of["resampling_error"]:
             note += (
@@ -202,13 +201,14 @@ def _classifier_table(classifiers: Mapping[str, Any], regions: Mapping[str, Any]
         for name, found in values["classifiers"].items():
             sds = found["area_sds_m2"]
             areas = [(label, area, sds.get(label)) for label, area in found["areas_m2"].items()]
-            for label, area, sd in (*areas, (OUTSIDE, found["outside_m2"], None)):
+            rest = rest_words(classifiers[name].get("limits", True))
+            for label, area, sd in (*areas, (rest, found["outside_m2"], None)):
                 shown = f"{_CM2_PER_M2 * area:.2f}" if sd is None else _with_sd(_CM2_PER_M2 * area, _CM2_PER_M2 * sd)
                 rows.append([region, name, label, shown, f"{area / values['area_m2']:.1%}"])
     note = (
         "Area of the surface whose most probable class is each; ± is its standard deviation by the classifier's own "
         "doubt, the noise of the spectra and the size of the mesh, and is left out where the dataset (--data) is not "
-        "known. Areas outside have spectra that it was not fitted on."
+        "known. Areas outside have spectra that it was not fitted on, which only a table with limits tells."
     )
     for name, of in classifiers.items():
         if of["resampling_error"]:
@@ -219,7 +219,14 @@ def _classifier_table(classifiers: Mapping[str, Any], regions: Mapping[str, Any]
     return TraitTable("Classifiers", note, ["region", "classifier", "class", "area, cm²", "of the region"], rows)
 
 
+def _outside(value: Mapping[str, Any], calibration: Mapping[str, Any]) -> str:
+    """Fraction of the area without a value."""
+    return f"{value['outside']:.1%}" + ("" if calibration.get("limits", True) else " (no limits stated)")
+
+
 def _map_mean(value: Mapping[str, float | None]) -> str:
+    if value["mean"] is None:
+        return "no value"
     std = value.get("std")
     return _with_sd(value["mean"], value["sd"], digits=3) + ("" if std is None else f" ({std:.2g})")
 
@@ -291,25 +298,6 @@ def write_page(path: Path, title: str, content: Mapping[str, Any], pictures: Map
         temporary.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
 
 
-def write_spectra(path: Path, wavelengths_nm: Float[np.ndarray, "bands"], traits: Traits) -> None:
-    """``spectra.csv``: a line a band; of each region the mean and the standard deviation over its surface.
-
-    Where material and light are told apart, both the material's and those as measured.
-    """
-    titles, columns = [], []
-    for region in traits.regions:
-        kinds = {"": region.spectrum}
-        if region.light is not None:
-            kinds = {" material": region.spectrum, " measured": region.light.measured}
-        for kind, spectrum in kinds.items():
-            titles += [f"{region.name}{kind} mean", f"{region.name}{kind} SD"]
-            columns += [spectrum.mean, spectrum.sd]
-    with atomic_write(path) as (temporary,), temporary.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["wavelength_nm", *titles])
-        writer.writerows([f"{number:.6g}" for number in row] for row in zip(wavelengths_nm, *columns, strict=True))
-
-
 def _plain_reflectance(region: RegionTraits) -> dict[str, float | None]:
     """Mean over the bands and its uncertainty; where light is told apart, the same as measured, and the light."""
     values = {"mean": region.spectrum.mean.mean(), "std": region.reflectance_std}
@@ -317,6 +305,12 @@ def _plain_reflectance(region: RegionTraits) -> dict[str, float | None]:
         values |= {"measured": light.measured.mean.mean(), "irradiance": light.irradiance.mean}
         values["irradiance_std"] = light.irradiance_std
     return {name: float(value) if np.isfinite(value) else None for name, value in values.items()}
+
+
+def _bounds(one: SurfaceMap | ClassMap) -> dict[str, float | bool | None]:
+    """How well a calibration fits the surface's bands and spectra; no error where no spectrum has a value."""
+    error = one.resampling_error
+    return {"resampling_error": error if math.isfinite(error) else None, "limits": one.limited}
 
 
 def _plain_areas(names: Sequence[str], found: ClassAreas, relative_sd: float) -> dict[str, Any]:

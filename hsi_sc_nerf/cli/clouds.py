@@ -118,6 +118,35 @@ class TraitsCommand:
     piece: int | None = between(1, math.inf, default=None)
     """Of several objects, measure this one alone: 1 is the largest."""
 
+    def check(self) -> None:
+        """Refuse what fits no cloud, so that nobody learns it after hours of training.
+
+        Raises:
+            InputError: an option, or a file that one names, cannot be used.
+        """
+        from hsi_sc_nerf.analysis.calibrations import read_calibration
+        from hsi_sc_nerf.analysis.drawn_regions import read_drawn_regions
+        from hsi_sc_nerf.analysis.library import read_library
+        from hsi_sc_nerf.indices.catalogue import find_index
+
+        check_options(self)
+        if self.classes and self.library is None:
+            raise InputError("--classes names spectra of a library; give it with --library.")
+        names = [name for name, *_ in self.roi]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise InputError(f"--roi gives two regions the name {twice[0]}; give each a name of its own.")
+        if self.propose_regions and self.piece is not None:
+            raise InputError("--propose-regions looks at clouds of one object; leave out --piece or this option.")
+        if self.library:
+            library = read_library(self.library)
+            library.only(self.classes or library.names)
+        if self.roi_file:
+            read_drawn_regions(self.roi_file)
+        for word in self.index:
+            find_index(word)
+        for path in self.calibration:
+            read_calibration(path)
+
     def main(self) -> None:
         """Measure and write.
 
@@ -132,11 +161,7 @@ class TraitsCommand:
         from hsi_sc_nerf.export.cloud import read_spectral_ply
         from hsi_sc_nerf.packed.dataset import open_packed
 
-        check_options(self)
-        if self.classes and self.library is None:
-            raise InputError("--classes names spectra of a library; give it with --library.")
-        if self.propose_regions and self.piece is not None:
-            raise InputError("--propose-regions looks at clouds of one object; leave out --piece or this option.")
+        self.check()
         require_writable(self.output_dir)
         library = read_library(self.library) if self.library else None
         if library is not None and self.classes:

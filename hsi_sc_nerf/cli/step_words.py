@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from contextlib import redirect_stderr, redirect_stdout
+from functools import partial
 from typing import Any
 
 import tyro
@@ -25,20 +26,25 @@ def check_words(settings: SessionSettings) -> None:
     from hsi_sc_nerf.cli.sessions import ProcessCommand
 
     # What the steps give themselves: any text will do.
-    _check("process", settings.process, ProcessCommand, "session", "--output-dir", "out")
-    _check("material", settings.material, MaterialCommand, "cloud", "--load-config", "config.yml")
-    _check("traits", settings.traits, TraitsCommand, "cloud", "--output-dir", "out")
+    process = _read("process", settings.process, ProcessCommand, "session", "--output-dir", "out")
+    material = _read("material", settings.material, MaterialCommand, "cloud", "--load-config", "config.yml")
+    traits = _read("traits", settings.traits, TraitsCommand, "cloud", "--output-dir", "out")
+    for name, check in (
+        ("process", partial(check_options, process.config)),
+        ("material", partial(check_options, material)),
+        ("traits", traits.check),
+    ):
+        try:
+            check()
+        except InputError as error:
+            raise InputError(f"--{name}: {error}") from error
 
 
-def _check(name: str, words: str, command: Any, *given: str) -> None:
+def _read(name: str, words: str, command: Any, *given: str) -> Any:
     try:
         with redirect_stderr(io.StringIO()), redirect_stdout(io.StringIO()):
-            read = tyro.cli(command, args=[*given, *split_words(words)])
+            return tyro.cli(command, args=[*given, *split_words(words)])
     except SystemExit as end:
         raise InputError(
             f"--{name}: the step '{name}' cannot be called with {words}; see `hsi-sc-nerf {name} --help`."
         ) from end
-    try:
-        check_options(read.config if name == "process" else read)
-    except InputError as error:
-        raise InputError(f"--{name}: {error}") from error

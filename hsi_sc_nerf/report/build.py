@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hsi_sc_nerf.analysis.calibrations import Calibration, read_calibration
-from hsi_sc_nerf.analysis.class_maps import OUTSIDE
 from hsi_sc_nerf.analysis.drawn_regions import PAGE_POINTS, points_of_page
 from hsi_sc_nerf.analysis.report import each_object
 from hsi_sc_nerf.errors import InputError
@@ -147,7 +146,7 @@ def _class_tables(classifiers: Sequence[Mapping[str, Any]]) -> list[Table]:
     rows = [
         [one["name"], label, f"{area:.2f}", f"{area / max(sum(one['areas_cm2']), 1e-12):.1%}"]
         for one in classifiers
-        for label, area in zip((*one["classes"], OUTSIDE), one["areas_cm2"], strict=True)
+        for label, area in zip((*one["classes"], one["rest"]), one["areas_cm2"], strict=True)
     ]
     caption = (
         "Area of the points whose most probable class is each. hsi-sc-nerf traits --calibration measures them on the "

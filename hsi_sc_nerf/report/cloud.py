@@ -13,7 +13,7 @@ from matplotlib import colormaps
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.analysis.calibrations import Calibration
-from hsi_sc_nerf.analysis.class_maps import most_probable
+from hsi_sc_nerf.analysis.class_maps import most_probable, rest_words
 from hsi_sc_nerf.analysis.classes import UNCLASSIFIED, class_areas_m2
 from hsi_sc_nerf.export.cloud import SpectralCloud, band_property_names, material_spectra
 from hsi_sc_nerf.indices.catalogue import find_indices
@@ -139,6 +139,7 @@ def _classified(one: _Calibrated, areas_m2: Float[np.ndarray, "n"]) -> dict[str,
     return {
         "name": calibration.name,
         "classes": list(calibration.classes),
+        "rest": rest_words(calibration.domain is not None),
         "labels": _base64(counts),
         "areas_cm2": areas_cm2.tolist(),
     }

@@ -1,5 +1,6 @@
 """Calibrations against scikit-learn's regressions, on simulated spectra."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,10 @@ from scipy.signal import savgol_filter
 from sklearn.cross_decomposition import PLSRegression
 
 from hsi_sc_nerf.analysis.calibrations import calibration_map, read_calibration
+from hsi_sc_nerf.analysis.report import trait_content, trait_tables
+from hsi_sc_nerf.analysis.size import size_of
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
+from hsi_sc_nerf.analysis.traits import analyse
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.simulate.mesh import cylinder
 
@@ -99,6 +103,30 @@ def test_each_limit_counts_alone(fitted):
         other = {"t2_limit": "q_limit", "q_limit": "t2_limit"}[key]
         fitted.write_text("\n".join(line for line in lines if not line.startswith(f"# {other}")))
         assert np.isnan(read_calibration(fitted).values(extreme, only_inside=True)).all()
+
+
+def test_the_table_says_where_no_limits_are_stated(fitted):
+    limits = ("# t2_limit", "# q_limit")
+    free = fitted.with_name("free.csv")
+    free.write_text("\n".join(line for line in fitted.read_text().splitlines() if not line.startswith(limits)))
+    surface = surface_of(simulated(50)[0])
+    shown = []
+    for path in (fitted, free):
+        traits = analyse(surface, maps=[calibration_map(surface, read_calibration(path))])
+        content = trait_content(size_of(surface.mesh), {}, True, traits, {})
+        shown += [row[-1] for one in trait_tables(content) if one.heading == "Calibrations" for row in one.rows]
+    assert shown == ["4.0%", "0.0% (no limits stated)"]
+
+
+def test_a_surface_that_the_calibration_does_not_know_has_no_value_in_the_table_and_null_in_json(fitted):
+    strange = simulated(20)[0] + 0.1 * np.exp(-(((NM - 500) / 10) ** 2))
+    surface = surface_of(strange[:, ::2], NM[::2])
+    traits = analyse(surface, maps=[calibration_map(surface, read_calibration(fitted))])
+    content = trait_content(size_of(surface.mesh), {}, True, traits, {})
+    json.dumps(content["calibrations"], allow_nan=False)
+    (shown,) = (one for one in trait_tables(content) if one.heading == "Calibrations")
+    assert [row[-2:] for row in shown.rows] == [["no value", "100.0%"]]
+    assert "nan" not in shown.note
 
 
 def test_a_map_of_the_same_bands_is_not_resampled(fitted):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hsi_sc_nerf.analysis.calibrations import Calibration, Domain, read_calibration
-from hsi_sc_nerf.analysis.class_maps import OUTSIDE, class_areas, class_map
+from hsi_sc_nerf.analysis.class_maps import OUTSIDE, WITHOUT_LIMITS, class_areas, class_map
 from hsi_sc_nerf.analysis.pictures import SideViews
 from hsi_sc_nerf.analysis.report import trait_content, trait_tables
 from hsi_sc_nerf.analysis.size import Size, size_of
@@ -136,7 +136,7 @@ def test_a_class_named_outside_is_not_what_the_classifier_does_not_know():
 
 
 def test_an_onnx_classifier_on_the_page_in_the_tables_and_in_the_mesh(tmp_path):
-    """Region by region, with the uncertainty of the mesh's size in it."""
+    """Region by region, with the uncertainty of the mesh's size in it; its table states no limits."""
     pytest.importorskip("onnxruntime")
     (tmp_path / "classes.onnx").write_bytes((MODELS / "classes.onnx").read_bytes())
     table = tmp_path / "ripe.csv"
@@ -162,9 +162,11 @@ def test_an_onnx_classifier_on_the_page_in_the_tables_and_in_the_mesh(tmp_path):
         np.testing.assert_allclose(list(areas["area_sds_m2"].values()), np.hypot(bare.stds_m2, shared))
     (rows,) = (one.rows for one in trait_tables(content) if one.heading == "Classifiers")
     assert [row[:3] for row in rows] == [
-        [region, "ripe", label] for region in ("whole surface", "side") for label in ("unripe", "ripe", OUTSIDE)
+        [region, "ripe", label]
+        for region in ("whole surface", "side")
+        for label in ("unripe", "ripe", WITHOUT_LIMITS)
     ]
-    assert all("±" in row[3] for row in rows if row[2] != OUTSIDE)
+    assert all("±" in row[3] for row in rows if row[2] != WITHOUT_LIMITS)
 
 
 def test_what_has_no_value_is_striped_in_pictures_and_the_rest_as_it_was():

@@ -80,6 +80,22 @@ def test_each_object_is_measured_by_itself(tmp_path):
     assert [caption[:14] for caption in captions if "Size" in caption] == ["Piece 1. Size.", "Piece 2. Size."]
     assert [finding.sentence[:7] for finding in section.findings] == ["Piece 1", "Piece 2"]
 
+    # The same folder again, with another number of objects.
+    own = tmp_path / "piece-2" / "notes.txt"
+    own.write_text("of the user")
+    (tmp_path / "calibration_tissue.png").touch()
+    write_pieces(tmp_path, measured[:1], "two balls", piece=1)
+    assert {"traits.json", "traits.md", "mesh.ply", "spectra.csv"} < set(names := files_in(tmp_path))
+    assert {name for name in names if name.startswith(("piece-", "calibration_"))} == {"piece-2/notes.txt"}
+    write_pieces(tmp_path, measured, "two balls")
+    assert {name for name in files_in(tmp_path) if "/" not in name} == {"traits.json", "traits.md"}
+    assert own.is_file()
+    assert (tmp_path / "piece-1" / "region_spectra.png").is_file()
+
+
+def files_in(folder):
+    return [str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()]
+
 
 def test_organs_are_proposed_of_clouds_of_one_object(tmp_path):
     with pytest.raises(InputError, match="leave out --piece or this option"):

@@ -16,6 +16,8 @@ from hsi_sc_nerf.analysis.classes import (
 )
 from hsi_sc_nerf.analysis.library import SpectralLibrary
 from hsi_sc_nerf.analysis.maps import SurfaceMap, index_maps
+from hsi_sc_nerf.analysis.measurement import measure_traits
+from hsi_sc_nerf.analysis.measurement_files import write_spectra
 from hsi_sc_nerf.analysis.pictures import SideViews
 from hsi_sc_nerf.analysis.report import trait_tables
 from hsi_sc_nerf.analysis.size import Size
@@ -127,7 +129,9 @@ def test_tables_and_json_hold_maps():
     surface = two_halves()
     maps = index_maps(surface, find_indices(["NDVI"], NM))
     half = np.where(surface.mesh.vertices[:, 1] > 0.0, 12.0, np.nan)
-    maps.append(SurfaceMap("sugar", "°Brix", half, lambda spectra: spectra[:, 0], 0.4, "", "°Brix", 0.03))
+    maps.append(
+        SurfaceMap("sugar", "°Brix", half, lambda spectra: spectra[:, 0], 0.4, "", "°Brix", 0.03, limited=True)
+    )
     traits = analyse(surface, maps=maps)
     content = report.trait_content(Size(*[1.0] * 6), {}, True, traits, {})
     assert content["indices"] == ["NDVI = (R800 - R670) / (R800 + R670) [0, 1]"]
@@ -221,7 +225,7 @@ def test_a_cloud_by_material_gives_both_reflectances(tmp_path):
     read = read_spectral_ply(tmp_path / "mesh.ply")
     np.testing.assert_allclose(read.spectra, found.lit.measured)
     np.testing.assert_allclose(material_spectra(read), found.spectra)
-    report.write_spectra(tmp_path / "spectra.csv", NM, analyse(found, spots))
+    write_spectra(tmp_path / "spectra.csv", NM, analyse(found, spots))
     titles = (tmp_path / "spectra.csv").read_text().splitlines()[0].split(",")
     assert titles[5:9] == ["low material mean", "low material SD", "low measured mean", "low measured SD"]
 
@@ -266,6 +270,12 @@ def test_pictures_hold_tall_and_flat_objects(width_m, height_m, columns):
         assert hit.shape == pytest.approx((420, columns), abs=1)
         assert np.ptp(np.flatnonzero(hit.any(axis=0))) == pytest.approx(columns / 1.04, rel=0.01)
         assert hit.any(axis=1).mean() == pytest.approx(height_m / width_m * columns / 420 / 1.04, rel=0.05)
+
+
+def test_a_region_with_the_name_of_a_class_is_refused_before_the_cloud_is_looked_at():
+    library = SpectralLibrary(("skin", "bruise", "bruise"), NM, np.ones((3, len(NM))))
+    with pytest.raises(InputError, match="two regions or classes are named bruise"):
+        measure_traits(None, library=library, regions={"bruise": (0.0, 0.0, 0.0, 0.01)})
 
 
 def test_regions_off_the_surface_or_of_one_name_are_refused():

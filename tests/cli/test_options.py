@@ -65,6 +65,11 @@ def test_nonsense_is_one_sentence(config, told):
     [
         (SessionSettings(process="--masks.pieces 0"), r"--process: --masks\.pieces is 0; it must lie"),
         (SessionSettings(traits="--idx PRI"), "--traits: the step 'traits' cannot be called with --idx PRI"),
+        (SessionSettings(traits="--index PRY"), "--traits: there is no index 'PRY'"),
+        (SessionSettings(traits="--calibration none.csv"), r"--traits: none\.csv: cannot be read \(No such file"),
+        (SessionSettings(traits="--library none.csv"), r"--traits: none\.csv"),
+        (SessionSettings(traits="--roi-file none.json"), r"--traits: none\.json"),
+        (SessionSettings(traits="--roi a 0 0 0 1 --roi a 0 0 1 1"), "--traits: --roi gives two regions the name a"),
         (SessionSettings(material="--white-azimuth-deg nan"), "--material: --white-azimuth-deg is nan"),
     ],
 )

@@ -1,4 +1,5 @@
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -62,6 +63,16 @@ def test_ranges_hold_the_index_of_a_leaf(name):
     assert low - 0.1 * (high - low) <= value <= high + 0.1 * (high - low)
     assert CATALOGUE[name].reference
     assert CATALOGUE[name].tells
+
+
+def test_the_documentation_shows_the_catalogue():
+    page = (Path(__file__).parents[2] / "docs" / "how-to" / "indices.md").read_text(encoding="utf-8")
+    shown = [
+        [cell.strip(" `") for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("| ")
+    ]
+    ends = {name: "{:g} to {:g}".format(*one.drawn_range) for name, one in CATALOGUE.items()}
+    expected = [[n, one.expression, ends[n], one.tells, one.reference] for n, one in CATALOGUE.items()]
+    assert shown[2:] == expected
 
 
 def test_names_and_formulas_are_found():

@@ -414,7 +414,13 @@ def test_the_scale_bar_is_as_long_as_it_says_and_the_page_has_its_own_colours(br
         assert page.evaluate(ground) == "rgb(255, 255, 255)"
         page.select_option("select[name=theme]", "dark")
         assert page.evaluate(ground) == "rgb(20, 24, 28)"
-        page.emulate_media(media="print")
+        page.emulate_media(media="print", color_scheme="dark")
+        # On paper the colours are those of a light page, and what is folded does not grow over the sheet's rest.
+        colour, inside = (
+            f"getComputedStyle(document.querySelector('{one}'))" for one in ("a", "details:not([open])")
+        )
+        assert page.evaluate(f"{colour}.color") == "rgb(0, 88, 138)"
+        assert page.evaluate(f"{inside}.breakInside") == "avoid"
         assert page.evaluate(ground) == "rgb(255, 255, 255)"
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hsi_sc_nerf.analysis.calibrations import Calibration, Domain
-from hsi_sc_nerf.analysis.class_maps import OUTSIDE
+from hsi_sc_nerf.analysis.class_maps import OUTSIDE, WITHOUT_LIMITS
 from hsi_sc_nerf.export.cloud import SpectralCloud, band_property_names
 from hsi_sc_nerf.report.build import object_section
 from hsi_sc_nerf.report.cloud import TOLERANCE, cloud_payload, compress_spectra, point_areas_m2, quantise
@@ -161,4 +161,6 @@ def test_a_classifier_gives_each_point_its_class_and_each_class_its_area():
     assert [row[:3] for row in table.rows] == [
         ["part", name, f"{area:.2f}"] for name, area in zip(("lower", "outside", OUTSIDE), sums, strict=True)
     ]
+    (table,) = object_section(marked, 500, (), [replace(one, domain=None)]).blocks[1:]
+    assert [row[1] for row in table.rows] == ["lower", "outside", WITHOUT_LIMITS]
     assert object_section(marked, 500).blocks[1:] == []

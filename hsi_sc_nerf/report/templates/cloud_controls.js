@@ -31,8 +31,8 @@ function start(root, cloud) {
   }
 
   /** A dot a class, and its area on the page's points. */
-  function showClasses({ name, classes, areas_cm2 }) {
-    const items = [...classes, UNKNOWN].map((label, i) => {
+  function showClasses({ name, classes, rest, areas_cm2 }) {
+    const items = [...classes, rest].map((label, i) => {
       const item = element("span", { class: "class" }, `${label} ${areas_cm2[i].toFixed(2)} cm²`);
       item.prepend(i < classes.length ? dot(i % CLASS_COLOURS) : element("span", { class: "dot unknown" }));
       return item;

@@ -3,7 +3,6 @@
 const FRONT_DEPTH = 0.05;
 const FILE_KIND = "hsi-sc-nerf regions";
 const FAR_SPACINGS = 2;
-const UNKNOWN = "outside of what the classifier knows";
 
 /** Whether a place lies inside a closed line, by the number of its sides to the right (even-odd rule). */
 function inside([x, y], line) {
@@ -56,7 +55,7 @@ function measured(cloud, points) {
 function wordsOf({ points, area_cm2, indices, areas }) {
   const means = indices.filter(({ mean_sd: [mean] }) => Number.isFinite(mean)).map(({ name, unit, mean_sd: [mean, sd] }) => (
     `${name} ${mean.toPrecision(3)} ± ${sd.toPrecision(2)} ${unit}`.trim()));
-  const classed = areas.map(({ name, classes, areas_cm2 }) => `${name}: ${[...classes, UNKNOWN].map((label, i) => (
+  const classed = areas.map(({ name, classes, rest, areas_cm2 }) => `${name}: ${[...classes, rest].map((label, i) => (
     `${label} ${areas_cm2[i].toFixed(2)} cm²`)).join(", ")}`);
   return [`${points.length} points, ${area_cm2.toPrecision(3)} cm²`, ...means, ...classed].join("; ");
 }
