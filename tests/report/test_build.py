@@ -184,7 +184,7 @@ def test_files_that_are_something_else_are_refused_and_nothing_is_written(run, t
         (ReportSources(comparison=run / "no.json"), r"no\.json: there is no such file"),
         (ReportSources(views=0), "at least 1"),
         (ReportSources(indices=("own = R1240",)), "1240 nm"),
-        (ReportSources(calibrations=(run / "no.csv",)), r"no\.csv: is no table of a calibration"),
+        (ReportSources(calibrations=(run / "no.csv",)), r"no\.csv: cannot be read"),
     ):
         with pytest.raises(InputError, match=sentence):
             write_report(run, tmp_path / "report.html", sources)
