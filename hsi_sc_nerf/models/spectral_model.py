@@ -51,7 +51,7 @@ from hsi_sc_nerf.processing.spectral_subspace import training_subspace
 FREE_SPACE_WEIGHT = 0.01
 """Of the loss of what is above the support beside the object (docs/validation/surface.md)."""
 SUPPORT_SOFTNESS_M = 0.002
-"""The support's own density reaches this far above it."""
+"""The support's own density reaches this far above it. Without a known container, its height is known too badly."""
 METRIC_STRIDE = 8
 """The metrics of a batch are those of every so many of its rays: they are drawn, and nothing learns from them."""
 
@@ -172,7 +172,8 @@ class SpectralModel(NerfactoModel):
             grid = build_occupancy(dataset, metadata["frames"], self.scene_box.aabb, from_checkpoint)
             self.proposal_sampler = OccupancySampler(grid, config.num_nerf_samples_per_ray, config.predict_normals)
         base, top = metadata["object_box"][:, 2].tolist()
-        self.support_height = base + SUPPORT_SOFTNESS_M * (top - base) / float(np.ptp(dataset.object_box_m[:, 2]))
+        softness = SUPPORT_SOFTNESS_M * (top - base) / float(np.ptp(dataset.object_box_m[:, 2]))
+        self.support_height = None if dataset.container is None else base + softness
         self.field = build_field(
             config,
             len(dataset.wavelengths_nm),
@@ -322,7 +323,7 @@ class SpectralModel(NerfactoModel):
             losses["interlevel_loss"] = config.interlevel_loss_mult * interlevel_loss(
                 outputs["weights_list"], outputs["ray_samples_list"]
             )
-        else:
+        elif self.support_height is not None:
             losses["free_space_loss"] = FREE_SPACE_WEIGHT * self._free_space(outputs, batch) / len(target)
         losses["distortion_loss"] = config.distortion_loss_mult * metrics_dict["distortion"]
         if config.predict_normals:
