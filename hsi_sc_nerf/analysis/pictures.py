@@ -23,6 +23,7 @@ from hsi_sc_nerf.spectra import available_composites, composite
 SIDES_DEG = {"camera's side": 0.0, "turned by 90°": 90.0, "by 180°": 180.0, "by 270°": 270.0}
 _HEIGHT_PX = 420
 _LABEL_IN = 1.4
+_LONGEST_NAME = 32
 """Height of a row's label."""
 GREY = 0.85
 """Grey value of unseen surface."""
@@ -173,7 +174,7 @@ def draw_classes(
         axes.set_title(title)
     areas_cm2 = 1e4 * class_areas_m2(labels, surface.areas_m2, surface.seen, len(names))
     patches = [
-        Patch(color=colours[index], label=f"{name}: {area:.2f} cm²")
+        Patch(color=colours[index], label=f"{_in_legend(name)}: {area:.2f} cm²")
         for index, (name, area) in enumerate(zip(names, areas_cm2[:-1], strict=True))
         if area > 0
     ]
@@ -182,6 +183,12 @@ def draw_classes(
     patches += [_striped(rest) if striped else white, Patch(color=str(GREY), label="not seen")]
     figure.legend(handles=patches, loc="outside lower center", ncols=3, fontsize=8)
     save_figure(figure, path)
+
+
+def _in_legend(name: str) -> str:
+    """A name that leaves room for the curves; matplotlib would leave away one that begins with an underscore."""
+    short = name if len(name) <= _LONGEST_NAME else f"{name[: _LONGEST_NAME - 1]}…"
+    return f" {short}" if short.startswith("_") else short
 
 
 def _striped(label: str) -> Patch:
@@ -200,7 +207,7 @@ def draw_region_spectra(path: Path, wavelengths_nm: Float[np.ndarray, "bands"], 
         colour = "0.35" if index == 0 else COLOURS[(index - 1) % len(COLOURS)]
         mean, sd = region.spectrum.mean[order], region.spectrum.sd[order]
         axes.fill_between(nm, mean - sd, mean + sd, color=colour, alpha=0.18, linewidth=0)
-        label = f"{region.name} ({region.area_m2 * 1e4:.2f} cm²)"
+        label = f"{_in_legend(region.name)} ({region.area_m2 * 1e4:.2f} cm²)"
         axes.plot(nm, mean, color=colour, linewidth=1.5, marker="o" if len(nm) == 1 else None, label=label)
     axes.margins(x=0.0)
     axes.set(xlabel="wavelength (nm)", ylabel="reflectance, mean ± SD", ylim=(0, None))

@@ -21,7 +21,8 @@ from hsi_sc_nerf.files import read_json
 from hsi_sc_nerf.findings import Finding
 
 _PACKAGE = "hsi_sc_nerf.report"
-_SCRIPTS = tuple(f"cloud_{part}.js" for part in ("data", "renderer", "chart", "regions", "picture", "controls"))
+_PARTS = ("data", "renderer", "chart", "regions", "picture", "gestures", "controls")
+_SCRIPTS = tuple(f"cloud_{part}.js" for part in _PARTS)
 WIDEST_PX = 1600
 """Wider pictures are downscaled to this."""
 _QUALITY = 82

@@ -124,6 +124,10 @@ def test_sorting_by_mouse_and_keyboard_with_missing_values_last(browser, season)
         assert column(page, "volume, mL")[0] == "▲ 400.0 ± 2.0"
         page.click("thead button:text('object')")
         assert names(page) == listed
+        # On paper each sheet has the heads of the columns, whose words are whole.
+        page.emulate_media(media="print")
+        style = "one => [getComputedStyle(one).breakInside, getComputedStyle(one.querySelector('th')).overflowWrap]"
+        assert page.locator("thead").evaluate(style) == ["avoid", "break-word"]
 
 
 @pytest.mark.slow
@@ -203,6 +207,31 @@ def test_rows_and_points_lead_to_reports_and_columns_can_be_switched(browser, se
     page.click("summary")
     page.locator("label", has_text="train memory, MiB").locator("input").check()
     assert column(page, "train memory, MiB")[0] == "300"
+    page.close()
+
+
+@pytest.mark.slow
+@needs_browser
+def test_who_comes_back_from_a_report_finds_the_page_as_it_was(browser, season):
+    """The browser puts the controls back; the rows, columns and charts must be those that they say."""
+    page = browser.new_page()
+    page.goto((season / "index.html").as_uri())
+    page.fill("input[name=words]", "pear_05")
+    page.select_option(".facets label:has-text('genotype') select", "=A")
+    page.select_option("select[name=y]", label="ndvi")
+    page.click("summary")
+    page.locator("label", has_text="train memory, MiB").locator("input").check()
+    for _ in range(2):
+        page.click("thead button:text('volume, mL')")
+    read = "() => ['table', '#distribution', '[name=count]'].map((one) => document.querySelector(one).textContent)"
+    before = page.evaluate(read)
+    assert page.locator("tbody tr").count() == 5
+    page.locator("tbody a").first.click()
+    page.wait_for_url("**/report.html")
+    page.go_back()
+    page.wait_for_url("**/index.html")
+    page.locator("tbody tr").first.wait_for()
+    assert page.evaluate(read) == before
     page.close()
 
 

@@ -3,9 +3,10 @@ const data = JSON.parse(document.getElementById("objects").textContent);
 const find = (selector) => document.querySelector(selector);
 const named = (name) => find(`[name="${name}"]`);
 const everyRow = data.rows.map((_, index) => index);
-const chosen = new Set([data.places.object, data.places.status]);
-data.columns.forEach((column, at) => column.shown && data.rows.some((row) => row[at] !== null) && chosen.add(at));
-const sorted = { at: null, descending: false };
+// The order is kept for who comes back from a report, as the browser keeps the controls.
+const kept = history.state, isKept = kept !== null && data.columns[kept.at]?.label === kept.label;
+const sorted = isKept ? { at: kept.at, descending: kept.descending } : { at: null, descending: false };
+const boxes = new Map();
 const ALL = "all objects", EMPTY = "(empty)", MOST_CHOICES = 30, LISTED_OUTLIERS = 30;
 const textOf = (value) => (value === null || value === "" ? EMPTY : String(value));
 
@@ -37,13 +38,15 @@ function offerFacets(place) {
 
 function offerColumns(place) {
   for (const group of new Set(data.columns.map((column) => column.group))) {
-    const boxes = [...data.columns.keys()].filter((at) => data.columns[at].group === group
+    const labels = [...data.columns.keys()].filter((at) => data.columns[at].group === group
       && ![data.places.object, data.places.status].includes(at)).map((at) => {
-      const box = element("input", { type: "checkbox", checked: chosen.has(at), title: data.columns[at].definition });
-      box.addEventListener("change", () => { chosen[box.checked ? "add" : "delete"](at); drawTable(); });
+      const checked = data.columns[at].shown && data.rows.some((row) => row[at] !== null);
+      const box = element("input", { type: "checkbox", checked, title: data.columns[at].definition });
+      box.addEventListener("change", drawTable);
+      boxes.set(at, box);
       return element("label", {}, box, ` ${headed(data.columns[at])}`);
     });
-    if (boxes.length) place.append(element("fieldset", {}, element("legend", {}, group), ...boxes));
+    if (labels.length) place.append(element("fieldset", {}, element("legend", {}, group), ...labels));
   }
 }
 
@@ -66,7 +69,8 @@ const groupOf = (index) => {
 const sidesOf = (at) => outlierSides(grouped(everyRow, groupOf), (index) => data.rows[index][at]);
 
 function drawTable() {
-  const shown = [data.places.object, ...[...data.columns.keys()].filter((at) => chosen.has(at) && at !== data.places.object)];
+  const chosen = [...data.columns.keys()].filter((at) => at === data.places.status || boxes.get(at)?.checked);
+  const shown = [data.places.object, ...chosen];
   const order = visible();
   if (sorted.at !== null) {
     const compare = compareRows(sorted.at, data.columns[sorted.at].kind, sorted.descending);
@@ -74,6 +78,7 @@ function drawTable() {
   }
   drawHead(find("thead"), data, shown, sorted, (at) => {
     Object.assign(sorted, { at, descending: sorted.at === at && !sorted.descending });
+    history.replaceState({ ...sorted, label: data.columns[at].label }, "");
     drawTable();
   });
   drawRows(find("tbody"), data, shown, order, grouped(everyRow, groupOf));
@@ -116,4 +121,5 @@ window.addEventListener("resize", () => {
   if (window.innerWidth !== drawnWidth) drawCharts();
   drawnWidth = window.innerWidth;
 });
-drawAll();
+// Only now has the browser put back what was chosen before a report was opened.
+window.addEventListener("pageshow", drawAll);

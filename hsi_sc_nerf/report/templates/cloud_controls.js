@@ -1,6 +1,8 @@
 // The controls beside the object: what is shown, how it is turned, which spectra were picked.
 
 const MOST_CURVES = 6;
+const MOST_UNDONE = 50;
+const TOO_MANY = `There are ${MOST_CURVES} regions, which is the most; delete one.`;
 const CLASS_COLOURS = 7;
 const TURN_PER_SECOND = 0.35;
 
@@ -13,11 +15,10 @@ function download(blob, name) {
 function start(root, cloud) {
   const canvas = root.querySelector("canvas"), form = root.querySelector("form"), fields = form.elements;
   const legend = root.querySelector(".legend"), pickedBox = root.querySelector(".picked");
-  const lasso = root.querySelector(".lasso"), stroke = root.querySelector(".stroke"), tip = root.querySelector(".tip");
   const scale = root.querySelector(".scale");
   const told = root.querySelector(".told"), list = root.querySelector(".regions");
-  const renderer = new Renderer(canvas, cloud), picked = [], regions = [];
-  let current = null;
+  const renderer = new Renderer(canvas, cloud), picked = [], regions = [], past = [];
+  let current = null, unsaved = false;
 
   function showBar(low, high, words) {
     const stops = Array.from({ length: 9 }, (_, i) => {
@@ -116,11 +117,38 @@ function start(root, cloud) {
     drawSpectra();
   }
 
-  function addRegion(name, points) {
-    const series = freeSeries();
-    if (series < 0) { say(`There are ${MOST_CURVES} regions, which is the most; delete one.`); return; }
-    regions.push(current = { name, points, series, ...measured(cloud, points) });
+  /** Called before the regions change. */
+  function remember() {
+    past.push({ before: regions.map((region) => ({ ...region })), at: regions.indexOf(current), deed: fields.deed.value });
+    if (past.length > MOST_UNDONE) past.shift();
+    unsaved = true;
+  }
+
+  function undo() {
+    say(past.length ? "" : "There is nothing to undo.");
+    if (!past.length) return;
+    const { before, at, deed } = past.pop();
+    regions.splice(0, regions.length, ...before);
+    [current, fields.deed.value] = [regions[at], deed];
+    // A deleted region's colour may be a point's by now.
+    const taken = new Set(regions.map(({ series }) => series));
+    picked.splice(0, picked.length, ...picked.filter(({ series }) => !taken.has(series)));
+    picked.splice(0, picked.length + regions.length - MOST_CURVES);
     showRegions();
+  }
+
+  function addRegion(name, points) {
+    regions.push(current = { name: ownName(name), points, series: freeSeries(), ...measured(cloud, points) });
+    showRegions();
+  }
+
+  /** The name for a region, with a number where another one has it: `traits` measures no two of one name. */
+  function ownName(name, region) {
+    const taken = ["whole surface", ...regions.filter((one) => one !== region).map((one) => one.name)];
+    for (let number = 1; ; number++) {
+      const own = number > 1 ? `${name} ${number}` : name;
+      if (!taken.includes(own)) return own;
+    }
   }
 
   function showRegions() {
@@ -132,8 +160,21 @@ function start(root, cloud) {
       chosen.addEventListener("change", () => { current = region; });
       const name = element("input", { value: region.name, "aria-label": "Name of the region" });
       const away = element("button", { type: "button", "aria-label": `Delete ${region.name}` }, "Delete");
-      name.addEventListener("change", () => { region.name = name.value.trim() || region.name; showRegions(); });
-      away.addEventListener("click", () => { regions.splice(regions.indexOf(region), 1); showRegions(); });
+      // The list stays as it is, so that the focus does, too.
+      name.addEventListener("change", () => {
+        const wanted = ownName(name.value.trim() || region.name, region);
+        if (wanted !== region.name) remember();
+        name.value = region.name = wanted;
+        chosen.setAttribute("aria-label", `Change ${region.name}`);
+        away.setAttribute("aria-label", `Delete ${region.name}`);
+      });
+      away.addEventListener("click", () => {
+        const at = regions.indexOf(region);
+        remember();
+        regions.splice(at, 1);
+        showRegions();
+        (list.children[Math.min(at, regions.length - 1)]?.querySelector("button") ?? fields.drawing).focus();
+      });
       item.append(chosen, dot(region.series), name, away, element("p", {}, wordsOf(region)));
       return item;
     }));
@@ -141,17 +182,18 @@ function start(root, cloud) {
     drawSpectra();
   }
 
-  const withBrush = () => fields.drawing.checked && fields.tool.value === "brush";
-
   /** What was drawn becomes a region, or is added or moved to the chosen one, or taken from it. */
-  function closeLine(line, taking) {
-    const brush = withBrush(), radius = Number(fields.brush.value), deed = taking ? "take" : fields.deed.value;
+  function closeLine(line, radius, taking) {
+    const brush = radius !== null, deed = taking ? "take" : fields.deed.value;
     const found = new Set(pointsWhere(renderer, (place) => (
       brush ? distanceFrom(place, line) <= radius : inside(place, line))));
     say(found.size ? "" : `The line goes ${brush ? "over" : "round"} no point of the object.`);
     if (!found.size) return;
     if (deed === "take" && !current) { say("There is no region to take from."); return; }
-    if (deed === "new" || !current) {
+    const another = deed === "new" || !current;
+    if (another && regions.length >= MOST_CURVES) { say(TOO_MANY); return; }
+    remember();
+    if (another) {
       let number = regions.length + 1;
       while (regions.some(({ name }) => name === `region ${number}`)) number++;
       addRegion(`region ${number}`, [...found]);
@@ -159,27 +201,20 @@ function start(root, cloud) {
       return;
     }
     for (const region of deed === "move" ? [...regions] : [current]) {
-      const before = region.points.length, points = region.points.filter((point) => !found.has(point));
-      if (region === current && deed !== "take") points.push(...found);
+      const before = region.points.length, kept = region.points.filter((point) => !found.has(point));
+      const points = region === current && deed !== "take" ? [...kept, ...found] : kept;
       if (!points.length) regions.splice(regions.indexOf(region), 1);
       else if (region === current || points.length < before) Object.assign(region, { points }, measured(cloud, points));
     }
     showRegions();
   }
 
-  /** The brush's outline, where the pointer is or, for keys, in the middle. */
-  function showBrush(place) {
-    const [cx, cy] = place ?? [canvas.clientWidth / 2, canvas.clientHeight / 2], r = Number(fields.brush.value);
-    const shown = withBrush() && (place || canvas.matches(":focus-visible"));
-    for (const [name, value] of Object.entries({ cx, cy, r: shown ? r : 0 })) tip.setAttribute(name, value);
-    stroke.setAttribute("stroke-width", 2 * r);
-  }
-
   async function load(file) {
     try {
-      const found = regionsOf(cloud, await file.text());
-      say(found.length ? "" : "The file holds no region.");
-      for (const { name, points } of found) addRegion(name, points);
+      const found = regionsOf(cloud, await file.text()), room = MOST_CURVES - regions.length;
+      say(found.length > room ? TOO_MANY : "");
+      if (room) remember();
+      for (const { name, points } of found.slice(0, room)) addRegion(name.trim(), points);
     } catch (error) { say(`${file.name}: ${error.message}.`); }
   }
 
@@ -190,22 +225,6 @@ function start(root, cloud) {
     // A part of the picture's width, so that it stays right where the page is printed on a narrower sheet.
     scale.style.width = `${(100 * length * mm) / canvas.clientWidth}%`;
     scale.textContent = `${Number(length.toPrecision(1))} mm`;
-  }
-
-  function turn(right, up) {
-    renderer.azimuth -= right;
-    renderer.elevation = Math.min(1.55, Math.max(-1.55, renderer.elevation + up));
-    renderer.draw();
-  }
-
-  function move(right, up) {
-    renderer.shift = [renderer.shift[0] + right, renderer.shift[1] + up];
-    renderer.draw();
-  }
-
-  function zoom(factor) {
-    renderer.distance = Math.min(12, Math.max(1.3, renderer.distance * factor));
-    renderer.draw();
   }
 
   const groups = [
@@ -226,15 +245,18 @@ function start(root, cloud) {
   fields.band.addEventListener("input", () => { fields.shown.value = "band 0"; show(); });
   fields.shading.addEventListener("change", () => { renderer.shading = fields.shading.checked ? 1 : 0; renderer.draw(); });
   fields.size.addEventListener("input", () => { renderer.size = Number(fields.size.value); renderer.draw(); });
+  fields.undo.addEventListener("click", undo);
   fields.clear.addEventListener("click", () => { picked.length = 0; drawSpectra(); });
   fields.save.addEventListener("click", () => {
     if (picked.length || regions.length) download(new Blob([spectraFile(cloud, regions, picked)]), "spectra.csv");
     else say("Click on the object or draw a region first.");
   });
   fields.saveRegions.addEventListener("click", () => {
-    if (regions.length) download(new Blob([regionFile(cloud, regions)]), "regions.json");
-    else say("There is no region yet; tick \"draw regions\" and draw one.");
+    if (!regions.length) { say("There is no region yet; tick \"draw regions\" and draw one."); return; }
+    download(new Blob([regionFile(cloud, regions)]), "regions.json");
+    unsaved = false;
   });
+  fields.openRegions.addEventListener("click", () => fields.loadRegions.click());
   fields.loadRegions.addEventListener("change", () => {
     if (fields.loadRegions.files.length) load(fields.loadRegions.files[0]);
     fields.loadRegions.value = "";
@@ -246,74 +268,8 @@ function start(root, cloud) {
   fields.picture.addEventListener("click", () => (
     pictureOf(canvas, scale, legend, cloud.colours).toBlob((blob) => download(blob, "object.png"))));
 
-  const pointers = new Map();
-  let travelled = 0, line = null;
-  canvas.addEventListener("pointerdown", (event) => {
-    canvas.setPointerCapture(event.pointerId);
-    pointers.set(event.pointerId, [event.offsetX, event.offsetY]);
-    travelled = pointers.size > 1 ? Infinity : 0;
-    fields.turning.checked = false;
-    line = fields.drawing.checked && pointers.size === 1 ? [[event.offsetX, event.offsetY]] : null;
-    showLine();
-  });
-  canvas.addEventListener("pointermove", (event) => {
-    const before = pointers.get(event.pointerId), now = [event.offsetX, event.offsetY];
-    showBrush(now);
-    if (!before) return;
-    const [dx, dy] = [now[0] - before[0], now[1] - before[1]];
-    const other = [...pointers].find(([id]) => id !== event.pointerId);
-    pointers.set(event.pointerId, now);
-    travelled += Math.hypot(dx, dy);
-    if (line) {
-      line.push(now);
-      showLine();
-    } else if (other) {
-      const apart = ([a, b]) => Math.max(1, Math.hypot(a - other[1][0], b - other[1][1]));
-      zoom(apart(before) / apart(now));
-    } else if (event.shiftKey) {
-      const scale = (2 * renderer.distance * Math.tan(FIELD_OF_VIEW / 2)) / canvas.clientHeight;
-      move(dx * scale, -dy * scale);
-    } else if (travelled > 3) turn(0.01 * dx, 0.01 * dy);
-  });
-  canvas.addEventListener("pointerup", (event) => {
-    if (!pointers.delete(event.pointerId)) return;
-    if (line && (travelled > 3 || withBrush())) closeLine(line, event.shiftKey);
-    else if (travelled <= 3) pick(event.offsetX, event.offsetY);
-    stopLine();
-  });
-  canvas.addEventListener("pointercancel", (event) => { pointers.delete(event.pointerId); stopLine(); });
-  canvas.addEventListener("pointerleave", () => showBrush());
-  canvas.addEventListener("focus", () => showBrush());
-  canvas.addEventListener("blur", () => showBrush());
-  for (const field of [fields.drawing, fields.tool, fields.brush]) field.addEventListener("input", () => showBrush());
-  function showLine() {
-    lasso.setAttribute("points", line && !withBrush() ? line.join(" ") : "");
-    stroke.setAttribute("points", line && withBrush() ? [line[0], ...line].join(" ") : "");
-  }
-  function stopLine() {
-    line = null;
-    showLine();
-  }
-  canvas.addEventListener("wheel", (event) => {
-    event.preventDefault();
-    zoom(Math.exp(0.001 * event.deltaY));
-  }, { passive: false });
-  canvas.addEventListener("keydown", (event) => {
-    const moves = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] };
-    const by = moves[event.key];
-    if (by && event.shiftKey) move(by[0], by[1]);
-    else if (by) turn(...by);
-    else if ("+-".includes(event.key)) zoom(event.key === "+" ? 0.9 : 1.1);
-    else if ("[]".includes(event.key)) {
-      fields.brush.value = Number(fields.brush.value) + (event.key === "]" ? 2 : -2);
-      showBrush();
-    } else if (event.key === "Enter" || event.key === " ") {
-      const middle = [canvas.clientWidth / 2, canvas.clientHeight / 2];
-      if (withBrush()) closeLine([middle], event.shiftKey); else pick(...middle);
-    } else return;
-    fields.turning.checked = false;
-    event.preventDefault();
-  });
+  listen(root, renderer, fields, { pick, closeLine, undo });
+  window.addEventListener("beforeunload", (event) => { if (unsaved && regions.length) event.preventDefault(); });
   renderer.onDraw = drawScale;
   window.addEventListener("resize", () => renderer.draw());
   window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", showRegions);

@@ -110,7 +110,9 @@ function regionsOf(cloud, text) {
   let content;
   try { content = JSON.parse(text); } catch { throw new Error("the file is no JSON; give one that was saved here"); }
   const places = content?.points_m, isPlace = (place) => place?.length === 3 && place.every(Number.isFinite);
-  if (content?.kind !== FILE_KIND || !Array.isArray(content.regions) || !places?.length || !places.every(isPlace)) {
+  const isRegion = (one) => typeof one?.name === "string" && one.name.trim() && Array.isArray(one.points);
+  if (content?.kind !== FILE_KIND || !content.regions?.length || !content.regions.every(isRegion)
+    || !places?.length || !places.every(isPlace)) {
     throw new Error("the file holds no regions; give one that was saved here");
   }
   // The spacing of as many points on this surface as the file has.
@@ -122,7 +124,7 @@ function regionsOf(cloud, text) {
   const every = Array.from({ length: cloud.count }, (_, point) => point);
   const found = content.regions.map(({ name, points }) => {
     const chosen = new Set(points);
-    return { name: String(name), points: every.filter((point) => chosen.has(nearest[point])) };
+    return { name, points: every.filter((point) => chosen.has(nearest[point])) };
   }).filter(({ points }) => points.length);
   if (!found.length) throw new Error("its regions hold none of this page's points; write the report with more --points");
   return found;

@@ -30,6 +30,18 @@ class Renderer {
     this.canvas = canvas; this.gl = gl; this.cloud = cloud;
     this.azimuth = 0; this.elevation = 0.25; this.distance = 4.1; this.shift = [0, 0];
     this.size = 1; this.shading = 0; this.marks = []; this.onDraw = () => {};
+    this.rgb = new Uint8Array(3 * cloud.count);
+    this.load();
+    // Points of some times the distance of neighbours cover the gaps between them.
+    this.spacing = 2.8 * cloud.spacing;
+    // Phones take the graphics memory away from a page that is not looked at.
+    canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
+    canvas.addEventListener("webglcontextrestored", () => { this.load(); this.draw(); });
+  }
+
+  /** Bring the program and the points into the graphics memory. */
+  load() {
+    const { gl, cloud } = this;
     const program = gl.createProgram();
     for (const [type, source] of [[gl.VERTEX_SHADER, VERTEX_SHADER], [gl.FRAGMENT_SHADER, FRAGMENT_SHADER]]) {
       const shader = gl.createShader(type);
@@ -45,10 +57,8 @@ class Renderer {
     this.program = program;
     this.attribute("position", cloud.positions, gl.SHORT);
     this.attribute("normal", cloud.normals, gl.BYTE);
-    this.colourBuffer = this.attribute("colour", new Uint8Array(3 * cloud.count), gl.UNSIGNED_BYTE);
+    this.colourBuffer = this.attribute("colour", this.rgb, gl.UNSIGNED_BYTE);
     gl.enable(gl.DEPTH_TEST);
-    // Points of some times the distance of neighbours cover the gaps between them.
-    this.spacing = 2.8 * cloud.spacing;
   }
 
   attribute(name, values, type) {
@@ -61,6 +71,7 @@ class Renderer {
   }
 
   colour(rgb) {
+    this.rgb = rgb;
     this.gl.bindBuffer(this.gl.ARRAY_BUFFER, this.colourBuffer);
     this.gl.bufferSubData(this.gl.ARRAY_BUFFER, 0, rgb);
     this.draw();
