@@ -23,8 +23,9 @@ from hsi_sc_nerf.spectra import available_composites, composite
 SIDES_DEG = {"camera's side": 0.0, "turned by 90°": 90.0, "by 180°": 180.0, "by 270°": 270.0}
 _HEIGHT_PX = 420
 _LABEL_IN = 1.4
-_LONGEST_NAME = 32
 """Height of a row's label."""
+_LONGEST_NAME = 32
+"""Characters of a name in a legend; more would leave no room for the curves."""
 GREY = 0.85
 """Grey value of unseen surface."""
 _NEAR_WHITE = 0.97
