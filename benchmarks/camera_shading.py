@@ -37,8 +37,10 @@ NOISE = ("photon_noise", "read_noise")
 SCENES = {
     "pear, lamp without gloss": ("pear", ("lamp",)),
     "pear, lamp and gloss": ("pear", ("lamp", "gloss")),
+    "pear, lamp and shade": ("pear", ("lamp", "chamber_shading", "inter_reflection")),
     "tomato, lamp and its own gloss": ("tomato", ("lamp",)),
 }
+USUAL_STEPS = 700
 PATH_TRACED = "path-traced quince, two lamps"
 RIM_PX = 2
 VIEW, SHOWN_ERROR = "view.npz", 0.15
@@ -64,8 +66,8 @@ class CameraShadingTable(PaperTable):
 
     common: str = "--pipeline.datamanager.train-num-rays-per-batch 1024"
     """Words that every run gets, as in `hsi-sc-nerf benchmark`."""
-    iterations: int | None = 700
-    """Steps of each run."""
+    iterations: int | None = USUAL_STEPS
+    """Steps of each run; rows of another number state it."""
     threads: int | None = 1
     """CPU threads."""
     frames: int = 30
@@ -90,12 +92,16 @@ class CameraShadingTable(PaperTable):
         for name, (scene, effects) in SCENES.items():
             if self.only in name:
                 session = self.output_dir / name.replace(",", "").replace(" ", "-")
-                self.measured(name, session, self.simulated(scene, session, (*NOISE, *effects)))
+                self.measured(f"{name}{self._steps}", session, self.simulated(scene, session, (*NOISE, *effects)))
         if self.path_traced is not None and self.only in PATH_TRACED:
             data = process_session(self.path_traced, self.output_dir / "path-traced-data")
-            self.measured(PATH_TRACED, None, data)
+            self.measured(f"{PATH_TRACED}{self._steps}", None, data)
         if self.picture is not None:
             draw_views(self.picture, self.output_dir)
+
+    @property
+    def _steps(self) -> str:
+        return "" if self.iterations == USUAL_STEPS else f", {self.iterations} steps"
 
     def measured(self, name: str, session: Path | None, data: Path) -> None:
         """Train with each seed, judge, and write the row."""
@@ -111,7 +117,7 @@ class CameraShadingTable(PaperTable):
     def judged(self, session: Path | None, data: Path, seed: int) -> dict[str, float]:
         """Figures of one run; a run that was judged before is not judged again."""
         folder = f"{self.model.replace(' ', '-').replace(chr(39), '')}-{seed}"
-        runs = data.with_name(f"{data.name}-{folder}")
+        runs = data.with_name(f"{data.name}-{folder}{self._steps.replace(', ', '-').replace(' ', '-')}")
         configuration = own_configuration("shading=--pipeline.model.effects view_dependence")
         (run,) = self.trained([configuration], data, runs, seed)
         kept = runs / "judged.json"

@@ -25,6 +25,10 @@ normals noisy, more rounds the object (docs/notes/dead_ends.md)."""
 MAP_SIZES = (8, 16, 32, 64)
 """Sides of the maps over the normals, which go from -1 to 1 in x and y. A cell of the finest has 1.8 degrees."""
 MAP_CHANNELS, HIDDEN = 4, 32
+LIMB = 0.966
+"""Length in the image of the unit normals at 75 degrees from the camera's axis. Normals beyond have the shading of
+those. Pixels at the limb also cover what is behind it: shading of their own would take over its colour, and the
+surface come out too far, further with every step (docs/validation/effects.md)."""
 LARGEST_LOG_GAIN = 4.0
 """No lamp is 50 times brighter than the chamber's mean; what is more would be a step gone wrong."""
 
@@ -112,8 +116,9 @@ class CameraShading(nn.Module):
         """
         with torch.no_grad():
             normals, aside = self.across_image(origins, self.normals(positions), positions - self._axis)
+        within = normals * (LIMB / normals.norm(dim=-1, keepdim=True).clamp_min(LIMB))
         # At NaN, the gradient of grid_sample is written outside of its table.
-        at = (normals + self.parallax * aside).nan_to_num()[None, None]
+        at = (within + self.parallax * aside).nan_to_num()[None, None]
         looked_up = [
             functional.grid_sample(values, at, mode="bilinear", padding_mode="border", align_corners=True)[0, :, 0].T
             for values in self.maps

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from hsi_sc_nerf.fields.camera_shading import CameraShading, smoothed_grid
+from hsi_sc_nerf.fields.camera_shading import LIMB, CameraShading, smoothed_grid
 
 SHAPE, CELL, RADIUS = (48, 48, 40), 0.05, 0.7
 LOWER = torch.tensor([-1.2, -1.2, -1.0])
@@ -57,6 +57,25 @@ def test_object_and_support_have_functions_of_their_own():
         made.network.layers[0].weight[:, -1] += 1.0
     changed = (made(coefficients, points, origins) - before).abs().amax(dim=-1) > 1e-3
     assert torch.equal(changed, points[:, 2] < 0.0)
+
+
+def test_the_limb_has_the_shading_of_normals_before_it():
+    """Normals at 80 degrees from the camera's axis are taken for those at 75, and those at 60 and 70 differ."""
+    made, camera = shading(), pose(50.0)
+    made.network.layers[-1].weight.data.fill_(0.1)
+    for values in made.maps:
+        values.data.normal_()
+    aside = torch.tensor([math.cos(1.0), math.sin(1.0), 0.0])
+
+    def at(angle_deg: float) -> torch.Tensor:
+        angle = math.radians(angle_deg)
+        normal = math.sin(angle) * aside + math.cos(angle) * torch.tensor([0.0, 0.0, 1.0])
+        made._normals.copy_((camera[:3, :3] @ normal)[None, :, None, None, None])
+        return made(torch.ones(1, CHANNELS), torch.zeros(1, 3), camera[None, :3, 3])
+
+    torch.testing.assert_close(at(80.0), at(math.degrees(math.asin(LIMB))))
+    assert (at(70.0) - at(60.0)).abs().max() > 1e-3
+    assert (at(70.0) - at(80.0)).abs().max() > 1e-3
 
 
 def test_a_grid_without_matter_has_no_normals_and_finite_shading():
