@@ -246,3 +246,11 @@ def test_thin_parts_keep_their_edge():
     score[20:, 20] = 0.03
     mask = score > 0
     np.testing.assert_array_equal(at_half_coverage(mask, score, np.full((40, 40), 0.4), mask), mask)
+
+
+def test_a_thin_stem_is_not_judged_by_the_bright_body_that_it_stands_on():
+    coverage, stem = disc(12.0), np.zeros((40, 40), bool)
+    stem[2:9, 19:21] = True
+    score = np.where(stem, 0.05, 0.12 * coverage)
+    mask = (coverage > 0.5) | stem
+    np.testing.assert_array_equal(at_half_coverage(mask, score, np.full((40, 40), 0.4), mask), mask)
