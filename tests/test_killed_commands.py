@@ -85,14 +85,18 @@ def test_an_unknown_command_is_one_sentence(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-IGNORES = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
+IGNORES = "signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
 READY = "open('ready', 'w')\n"
+
+
+# Where the tests were started in the background, Ctrl-C is ignored in all that they start.
+HEEDS = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
 
 
 def python(script, folder):
     """A process as the benchmark starts them."""
     return subprocess.Popen(
-        [sys.executable, "-c", script], cwd=folder, start_new_session=True, stderr=subprocess.DEVNULL
+        [sys.executable, "-c", HEEDS + script], cwd=folder, start_new_session=True, stderr=subprocess.DEVNULL
     )
 
 
