@@ -80,7 +80,7 @@ def test_the_same_seed_gives_the_same_weights_and_another_does_not(tiny_dataset,
         weights = []
         for number, seed in enumerate((3, 3, 4)):
             machine = MachineConfig(seed=seed, device_type="cpu")
-            options = {"switch": 4, "max_num_iterations": 8, "machine": machine}
+            options = {"switch": 2, "max_num_iterations": 4, "machine": machine}
             made = longer(tiny_dataset, tmp_path / str(number), **options)
             made.train()
             weights.append(checkpoint(made.checkpoint_dir))
