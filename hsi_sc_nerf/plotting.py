@@ -11,6 +11,7 @@ Example:
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -66,10 +67,13 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 def save_figure(figure: Figure, path: Path) -> None:
     """Write the figure completely, or leave what is at ``path`` as it is.
 
+    Letters of names that the font lacks, such as Chinese ones, are drawn as boxes.
+
     Raises:
         InputError: the operating system refused to write.
     """
-    with atomic_write(Path(path)) as (temporary,):
+    with atomic_write(Path(path)) as (temporary,), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font", category=UserWarning)
         figure.savefig(temporary)
 
 

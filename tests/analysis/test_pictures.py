@@ -42,3 +42,10 @@ def test_any_name_is_in_the_legend_beside_curves_that_have_room(figures, tmp_pat
     (axes,) = figure.axes
     assert axes.get_position().width > 0.5
     assert legend.get_window_extent().x0 >= axes.get_window_extent().x1
+
+
+def test_letters_that_the_font_lacks_are_boxes_without_a_warning(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pictures.draw_region_spectra(tmp_path / "spectra.png", NM, Traits([region(WHOLE), region("果柄 \N{PEAR}")]))
+    assert (tmp_path / "spectra.png").stat().st_size > 0

@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import spyndex
+import vegspec
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.indices.catalogue import CATALOGUE, USUAL, available_indices, find_indices
@@ -39,6 +40,35 @@ SPYNDEX = {
 }
 
 
+# Names of vegspec (Thorp, USDA-ARS), which has the wavelengths of the papers itself.
+VEGSPEC = {
+    "NDVI": "NDVI",
+    "GNDVI": "GNDVI",
+    "NDVI705": "NDVI3",
+    "mND705": "SMNDVI",
+    "mSR705": "MSR2",
+    "VOG1": "VSR",
+    "MCARI": "MCARI",
+    "MCARI2": "MCARI2",
+    "TCARI": "TCARI",
+    "TCARI_OSAVI": "TOR",
+    "MTCI": "MTCI",
+    "PSSRa": "PSSRA",
+    "PSSRb": "PSSRB",
+    "PSSRc": "PSSRC",
+    "SIPI": "SIPI",
+    "NPCI": "NPCI",
+    "CRI1": "CRI500",
+    "CRI2": "CRI700",
+    "ARI1": "ARI",
+    "PRI": "PRI3",
+    "PSRI": "PSRI",
+    "WI": "WI",
+    "WBI": "PSR",
+    "NDWI": "NDWI",
+}
+
+
 @pytest.mark.parametrize("name", SPYNDEX)
 def test_indices_are_those_of_a_published_implementation(name):
     spectra = np.random.default_rng(0).uniform(0.05, 0.9, (20, len(FINE_NM)))
@@ -47,6 +77,18 @@ def test_indices_are_those_of_a_published_implementation(name):
     expected = spyndex.computeIndex(theirs, at)
     np.testing.assert_allclose(index_values(CATALOGUE[name], spectra, FINE_NM), expected, rtol=1e-9)
     assert set(CATALOGUE[name].wavelengths_nm) == set(bands.values())
+
+
+@pytest.mark.filterwarnings("ignore")  # of the indices that vegspec computes as well
+def test_indices_and_their_wavelengths_are_those_of_another_published_implementation():
+    spectra = np.random.default_rng(0).uniform(0.05, 0.9, (3, len(FINE_NM)))
+    theirs = [vegspec.VegSpec(FINE_NM, spectrum).indices for spectrum in spectra]
+    for ours, name in VEGSPEC.items():
+        expected = [values[name] for values in theirs]
+        found = index_values(CATALOGUE[ours], spectra, FINE_NM)
+        np.testing.assert_allclose(found, expected, rtol=1e-9, err_msg=ours)
+    # Neither has these at our wavelengths.
+    assert set(CATALOGUE) - set(SPYNDEX) - set(VEGSPEC) == {"IAD", "mARI"}
 
 
 @pytest.mark.parametrize("name", sorted(CATALOGUE))

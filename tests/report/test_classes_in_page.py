@@ -60,3 +60,21 @@ def test_classes_have_colours_and_areas_on_the_object_and_in_regions(browser, tm
         assert re.search(r"outside 0\.00 cm².*outside of what the classifier knows [1-9]", page.inner_text(".legend"))
         rows = [row.split("\n") for row in page.locator("table tbody tr").all_inner_texts()]
         assert [row[:2] for row in rows[3:5]] == [["dark half", "south"], ["dark half", "outside"]]
+
+
+@pytest.mark.slow
+@needs_browser
+def test_a_region_tells_for_which_part_a_calibration_has_a_value(browser, tmp_path):
+    dark = replace(halves(2.0), name="water", unit="%", predict=lambda spectra: spectra[:, :1], classes=())
+    section = object_section(ball(factory.WAVELENGTHS_NM), 4000, ["NDVI"], [dark])
+    path = tmp_path / "page.html"
+    path.write_text(html_page("", "", {}, [section]), encoding="utf-8")
+    with opened(browser, path, viewport={"width": 700, "height": 900}) as page:
+        page.check("input[name=drawing]")
+        for height, radius in ((0.7, 0.06), (0.3, 0.06), (0.55, 0.2)):
+            go_round(page, 0.5, height, radius)
+        south, north, both = page.locator(".regions p").all_inner_texts()
+    assert re.search(r"water 0\.200 ± [\d.e-]+ %$", south)
+    assert north.endswith("water no value")
+    part = re.search(r"water 0\.200 ± \S+ % \(of (\d+) % of the points, the others have no value\)$", both)
+    assert 20 < int(part[1]) < 80

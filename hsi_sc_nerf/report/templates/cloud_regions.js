@@ -32,9 +32,11 @@ function pointsWhere(renderer, chosen) {
   return front.filter(({ x, y }) => chosen([x, y])).map(({ point }) => point);
 }
 
+/** Mean and standard deviation of the values that there are, and what part of all these are. */
 function meanAndSd(values) {
   const finite = values.filter(Number.isFinite), mean = finite.reduce((a, b) => a + b, 0) / finite.length;
-  return [mean, Math.sqrt(finite.reduce((a, b) => a + (b - mean) ** 2, 0) / finite.length)];
+  const sd = Math.sqrt(finite.reduce((a, b) => a + (b - mean) ** 2, 0) / finite.length);
+  return [mean, sd, finite.length / values.length];
 }
 
 /** Area (cm²), also of each class, mean spectrum with its standard deviation, and the mean of each index. */
@@ -51,10 +53,13 @@ function measured(cloud, points) {
   };
 }
 
-/** Size, indices and areas of classes of a region, in words; an index without any value is left out. */
+/** Size, indices and areas of classes of a region, in words. */
 function wordsOf({ points, area_cm2, indices, areas }) {
-  const means = indices.filter(({ mean_sd: [mean] }) => Number.isFinite(mean)).map(({ name, unit, mean_sd: [mean, sd] }) => (
-    `${name} ${mean.toPrecision(3)} ± ${sd.toPrecision(2)} ${unit}`.trim()));
+  const means = indices.map(({ name, unit, mean_sd: [mean, sd, part] }) => {
+    if (!part) return `${name} no value`;
+    const of = part < 0.995 ? ` (of ${Math.max(1, Math.round(100 * part))} % of the points, the others have no value)` : "";
+    return `${name} ${mean.toPrecision(3)} ± ${sd.toPrecision(2)} ${unit}`.trim() + of;
+  });
   const classed = areas.map(({ name, classes, rest, areas_cm2 }) => `${name}: ${[...classes, rest].map((label, i) => (
     `${label} ${areas_cm2[i].toFixed(2)} cm²`)).join(", ")}`);
   return [`${points.length} points, ${area_cm2.toPrecision(3)} cm²`, ...means, ...classed].join("; ");
