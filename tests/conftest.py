@@ -28,7 +28,7 @@ os.environ.setdefault("TORCHDYNAMO_DISABLE", "1")
 os.environ.setdefault("GRPC_VERBOSITY", "NONE")
 
 # A long file that comes last is waited for by all other processes.
-LONGEST = ["test_batch_sessions.py", "test_end_to_end.py", "test_workflows.py", "test_build.py"]
+LONGEST = ["test_batch_sessions.py", "test_end_to_end.py", "test_workflows.py", "test_object_in_browser.py"]
 LONGEST += ["test_viewer_in_browser.py", "test_mitsuba.py", "test_nerfstudio_commands.py", "test_pose_methods.py"]
 LONGEST += ["test_resume.py"]
 

@@ -2,7 +2,6 @@
 
 import copy
 import errno
-import inspect
 import os
 import shutil
 import signal
@@ -14,7 +13,6 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from nerfstudio.configs import external_methods
 from nerfstudio.engine.trainer import TrainerConfig
 
 from hsi_sc_nerf import nerfstudio_commands as adapter
@@ -306,18 +304,6 @@ def test_a_script_under_import_is_adapted_once_complete(ours, other, monkeypatch
     made.load_config = ours.with_name("nowhere.yml")
     with pytest.raises(SystemExit, match=r"hsi-sc-nerf: .*there is no such file"):
         made.main()
-
-
-def test_external_methods_are_listed_without_a_look_at_sources_and_say_how_they_are_installed(monkeypatch, capsys):
-    looked_for = []
-    with monkeypatch.context() as patch:
-        patch.setattr(inspect, "getmodule", lambda *names: looked_for.append(names))
-        methods, _ = external_methods.get_external_methods()
-    assert len(methods) > 10
-    assert looked_for == []
-    with pytest.raises(SystemExit):
-        external_methods.ExternalMethodDummyTrainerConfig("x", external_methods.ExternalMethod("Install x.", []))
-    assert "Install x." in capsys.readouterr().out
 
 
 def test_ctrl_c_is_one_line_for_our_runs_alone(ours, other, capsys, monkeypatch):

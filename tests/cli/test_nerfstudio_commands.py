@@ -1,6 +1,7 @@
 """nerfstudio's own commands on a small run and a dataset of this package: the table of its how-to page."""
 
 import contextlib
+import inspect
 import json
 import shutil
 import socket
@@ -16,6 +17,7 @@ import pytest
 import small_trainer
 import torch
 import tyro
+from nerfstudio.configs import external_methods
 
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.nerfstudio_commands import extend_nerfstudio_commands
@@ -220,3 +222,15 @@ def test_stock_nerfacto_trains_on_our_dataset(tiny_dataset, tmp_path, ns_train, 
 def test_training_on_bad_data_ends_in_one_sentence(tmp_path, ns_train):
     with pytest.raises(SystemExit, match=r"^hsi-sc-nerf: [^\n]*nowhere[^\n]*\.$"):
         ns_train(f"hsi-sc-nerf --data {tmp_path / 'nowhere'}")
+
+
+def test_external_methods_are_listed_without_a_look_at_sources_and_say_how_they_are_installed(monkeypatch, capsys):
+    looked_for = []
+    with monkeypatch.context() as patch:
+        patch.setattr(inspect, "getmodule", lambda *names: looked_for.append(names))
+        methods, _ = external_methods.get_external_methods()
+    assert len(methods) > 10
+    assert looked_for == []
+    with pytest.raises(SystemExit):
+        external_methods.ExternalMethodDummyTrainerConfig("x", external_methods.ExternalMethod("Install x.", []))
+    assert "Install x." in capsys.readouterr().out

@@ -1,4 +1,5 @@
-import contextlib
+"""The spectral panel in nerfstudio's viewer."""
+
 import math
 from types import SimpleNamespace
 
@@ -6,69 +7,18 @@ import matplotlib
 import numpy as np
 import pytest
 import torch
-from nerfstudio.cameras.cameras import CameraType
-from nerfstudio.viewer.utils import CameraState, get_camera, parse_object
-from nerfstudio.viewer.viewer_elements import ViewerClick, ViewerControl, ViewerElement
+from fake_viewer import attach, rendered_as
+from nerfstudio.viewer.utils import parse_object
+from nerfstudio.viewer.viewer_elements import ViewerClick, ViewerElement
 from small_trainer import untrained_pipeline
 from viser.transforms import SO3
 
 from hsi_sc_nerf.data.dataparser import CAMERA_ROTATION, FRAME_INDEX
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.packed.cube import unpack
-from hsi_sc_nerf.plotting import BLANK, coloured
+from hsi_sc_nerf.plotting import BLANK
 from hsi_sc_nerf.spectra import COMPOSITES
-from hsi_sc_nerf.viewer.drawings import colour_bar, inline_image, spectra_plot
 from hsi_sc_nerf.viewer.panel import SpectralPanel, attach_spectral_panel, pick
-from hsi_sc_nerf.viewer.training_views import TrainingViews, angle_to_measured, frame_pixels
-
-LENS = PinholeIntrinsics(w=40, h=30, fl_x=50.0, fl_y=60.0, cx=19.0, cy=16.0)
-STRAIGHT = (0.0, 0.0, 0.0, 0.0)
-
-
-def test_colours_are_those_of_the_map_at_its_range(device):
-    values = torch.tensor([[0.5, 0.9015, 1.3], [torch.nan, -9.0, 9.0]], device=device)
-    table = matplotlib.colormaps["viridis"]
-    expected = [[table(0)[:3], table(128)[:3], table(255)[:3]], [BLANK, table(0)[:3], table(255)[:3]]]
-    np.testing.assert_allclose(coloured(values, (0.5, 1.3), "viridis").cpu(), expected, atol=1e-6)
-
-
-def rays_through(lens, lines, samples):
-    """OpenGL directions in the camera's frame through the middle of pixels."""
-    x = (samples + 0.5 - lens.cx) / lens.fl_x
-    y = (lines + 0.5 - lens.cy) / lens.fl_y
-    return torch.stack([x, -y, -torch.ones_like(x)], dim=-1)
-
-
-def test_rays_meet_the_pixels_that_they_were_made_from(device):
-    lines, samples = torch.meshgrid(torch.arange(-3, 33), torch.arange(-3, 43), indexing="ij")
-    rotation = torch.from_numpy(SO3.exp(np.array([0.3, -1.1, 2.0])).as_matrix()).float()
-    directions = 3.0 * rays_through(LENS, lines, samples) @ rotation.T
-    pixels, seen = frame_pixels(directions.to(device), rotation.to(device), LENS, STRAIGHT)
-    np.testing.assert_array_equal(pixels.cpu()[..., 0], lines)
-    np.testing.assert_array_equal(pixels.cpu()[..., 1], samples)
-    np.testing.assert_array_equal(seen.cpu(), (lines >= 0) & (lines < 30) & (samples >= 0) & (samples < 40))
-    assert not frame_pixels(-directions.to(device), rotation.to(device), LENS, STRAIGHT)[1].any()
-
-
-def test_angle_to_measured_is_that_of_two_spectra_where_seen_and_valid(device):
-    angles = torch.linspace(0.0, 1.0, 6).reshape(2, 3)
-    rendered = torch.stack([angles.cos(), angles.sin(), torch.zeros(2, 3)], dim=-1)
-    seen = torch.tensor([[True, False, True], [True, True, False]])
-    measured = torch.tensor([2.0, 0.0, 0.0]).repeat(4, 1)
-    measured[1, 2], valid = 77.0, torch.ones(4, 3, dtype=torch.bool)
-    valid[1, 2] = False  # another band's number is no measurement
-    valid[2, :2] = False  # one band left: no angle
-    result = angle_to_measured(*(t.to(device) for t in (rendered, measured, valid, seen)))
-    np.testing.assert_allclose(result.cpu(), [[0.0, np.nan, 0.4], [np.nan, 0.8, np.nan]], atol=1e-6)
-
-
-@pytest.mark.slow
-def test_drawings_are_pictures_in_markdown():
-    wavelengths_nm = np.linspace(400.0, 1000.0, 7)
-    plot = spectra_plot(wavelengths_nm, {"rendered": np.full(7, 0.5), "measured": np.full(7, np.nan)}, "a point")
-    for png in (plot, colour_bar((0.0, 0.2), "magma", "angle")):
-        assert png.startswith(b"\x89PNG")
-        assert inline_image(png, "text").startswith("![text](data:image/png;base64,iVBOR")
+from hsi_sc_nerf.viewer.training_views import TrainingViews
 
 
 @pytest.fixture(scope="module")
@@ -76,91 +26,13 @@ def pipeline(flagged_dataset):
     return untrained_pipeline(flagged_dataset)
 
 
-class FakeServer:
-    """What the panel uses of viser's server: one browser, a scene, a panel of texts."""
-
-    def __init__(self):
-        self.moves = []
-        self.camera = SimpleNamespace(aspect=1.5, on_update=self.moves.append)
-        self.labels = {}
-        own_scene = SimpleNamespace(
-            add_spline_catmull_rom=lambda *_, **__: None,
-            add_label=lambda name, text, **_: self.labels.update({name: text}),
-        )
-        self.client = SimpleNamespace(camera=self.camera, scene=own_scene, atomic=contextlib.nullcontext, client_id=0)
-        self.pointer = None
-        self.points = {}
-        self.scene = SimpleNamespace(
-            on_pointer_event=lambda event_type: lambda callback: setattr(self, "pointer", (event_type, callback)),
-            remove_pointer_callback=lambda: setattr(self, "pointer", None),
-            add_icosphere=lambda name, **sphere: self.points.update({name: sphere}),
-        )
-        self.opened, self.closed = [], []
-        self.gui = SimpleNamespace(add_markdown=lambda content, image_root: SimpleNamespace(content=content))
-
-    def on_client_connect(self, callback):
-        self.opened.append(callback)
-
-    def on_client_disconnect(self, callback):
-        self.closed.append(callback)
-
-    def get_clients(self):
-        return {0: self.client}
-
-    def moved_camera(self, size=(24, 36)):
-        """The camera that nerfstudio's viewer makes of the browser's."""
-        turn = SO3(self.camera.wxyz) @ SO3.from_x_radians(np.pi)
-        pose = np.concatenate([turn.as_matrix(), self.camera.position[:, None] / 10.0], axis=1)
-        state = CameraState(
-            fov=self.camera.fov,
-            aspect=size[1] / size[0],
-            c2w=torch.from_numpy(pose),
-            camera_type=CameraType.PERSPECTIVE,
-        )
-        return get_camera(state, size[0])
-
-
 @pytest.fixture
 def attached(pipeline):
-    """A panel, its browser, and the viewer that both belong to."""
-    model = pipeline.model
-    panel = SpectralPanel(model.wavelengths_nm, model.num_train_data)
-    server = FakeServer()
-    viewer = SimpleNamespace(
-        pipeline=pipeline,
-        viser_server=server,
-        train_lock=None,
-        render_statemachines={0: SimpleNamespace(interrupt_render_flag=False)},
-        get_model=lambda: model,
-        control_panel=SimpleNamespace(output_render="spectral_angle", split=False),
-        calls=(calls := []),
-        init_scene=lambda dataset, train_state: calls.append((dataset, train_state)),
-        set_camera_visibility=lambda visible: calls.append("cameras shown" if visible else "cameras hidden"),
-        toggle_cameravis_button=lambda: calls.append("button switched"),
-    )
-    found = [path for path, _ in parse_object(panel, ViewerElement, "panel")]
-    names = ("band", "composite", "index", "index_formula", "legend", "measured_view", "picking", "spectrum")
-    assert found == [f"panel/{name}" for name in names]
-    for _, control in parse_object(panel, ViewerControl, "panel"):
-        control._setup(viewer)
-    model.eval()
-    return panel, server, viewer
+    return attach(pipeline)
 
 
 def truth_of(pipeline, view):
     return unpack(pipeline.datamanager.train_dataset.frames[view].cube())
-
-
-def rendered_as(spectral, opacity=1.0):
-    """A stand-in for nerfstudio's rendering that remembers the camera and gives these spectra."""
-
-    def render(camera):
-        render.camera = camera
-        image = torch.from_numpy(spectral)
-        ones = torch.ones(*image.shape[:2], 1)
-        return {"rgb": 2.0 * image[..., :3], "spectral": image, "depth": ones, "accumulation": ones * opacity}
-
-    return render
 
 
 @pytest.mark.slow
