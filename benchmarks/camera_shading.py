@@ -152,12 +152,13 @@ def held_out_errors(config: Path, session: Path | None, kept_view: Path) -> dict
 
 @rc_context(STYLE)
 def draw_views(path: Path, folder: Path) -> None:
-    """A row for each session: the first held-out view as it is, and by each model, with its error."""
+    """A row for each session that all models have: the first held-out view as it is, and by each, with its error."""
     found: dict[str, dict[str, dict[str, np.ndarray]]] = {}
     for file in sorted(folder.glob(f"*-data-*-1/{VIEW}")):
         session, model = file.parent.name.removesuffix("-1").split("-data-")
         found.setdefault(session, {})[model.replace("-", " ")] = dict(np.load(file))
     models = sorted({model for views in found.values() for model in views}, reverse=True)
+    found = {session: views for session, views in found.items() if len(views) == len(models)}
     figure = new_figure(2.0 * (1 + 2 * len(models)), 2.1 * len(found))
     rows = figure.subplots(len(found), 1 + 2 * len(models), squeeze=False)
     for axes, views in zip(rows, found.values(), strict=True):
