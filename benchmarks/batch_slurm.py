@@ -135,6 +135,8 @@ def start(cluster: Cluster, sessions: Path, out: Path, steps: int) -> subprocess
     command += ["--executor", "slurm", "--jobs", 8, "--slurm-status-command", "squeue"]
     command += ["--slurm-init-seconds-before-status-checks", 5]
     command += ["--default-resources", "runtime=30", "slurm_partition=lab"]
+    # As many jobs at once as the node has cores; steps of such small sessions do not use two.
+    command += ["--set-threads", *(f"{step}=1" for step in STEPS)]
     with out.with_suffix(".log").open("ab") as log:
         return subprocess.Popen(typed_command(command), env=cluster.environment, stdout=log, stderr=subprocess.STDOUT)
 
