@@ -76,7 +76,7 @@ def draw_class_change(path: Path, first: Day, one: Comparison, views: SideViews)
         for number, name in enumerate(found.names)
         if (found.before == number).any() or (found.after == number).any()
     }
-    draw_rows(path, rows, key=class_key(there))
+    draw_rows(path, rows, key=class_key(there, "in no class; in the last row: as before"))
 
 
 @rc_context(STYLE)
