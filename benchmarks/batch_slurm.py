@@ -5,14 +5,15 @@
 
 Starts Debian's munged, slurmctld and slurmd as root, with files of their own in a temporary folder, whose slurm.conf
 /etc/slurm/slurm.conf points at meanwhile (where there is one, nothing is done), and
-`hsi-sc-nerf batch --executor slurm` on simulated sessions, one of them broken. As soon as a training has left a
-checkpoint, slurmd and all processes of its jobs are killed (SIGKILL) and slurmd is started anew. If the batch ends
-early for that, it is started again. At the end every step should
-have its record, and all but the broken session their report.
+`hsi-sc-nerf batch --executor slurm` on the six sessions of ``six_sessions.py``, of which one is broken and one has no
+markers. As soon as the training of pear_2 has left a checkpoint, slurmd and all processes of its jobs are killed
+(SIGKILL) and slurmd is started anew. If the batch ends early for that, it is started again. At the end every step
+should have its record, the four whole sessions their report, and the two others a sentence in traits.csv.
 """
 
 from __future__ import annotations
 
+import csv
 import os
 import signal
 import socket
@@ -20,26 +21,20 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import NoReturn
 
 import tyro
 from results_table import RESULTS, write_results
+from six_sessions import OBJECTS, TRAIN, TRAITS, write_six_sessions
 
 from hsi_sc_nerf.batch.plan import STEPS, read_plan
 from hsi_sc_nerf.benchmark.steps import available_cores, typed_command
 from hsi_sc_nerf.files import read_json
-from hsi_sc_nerf.simulate.scene import load_scene, override
-from hsi_sc_nerf.simulate.session import simulate_session
 
-COLUMNS = ["sessions", "broken", "SLURM jobs", "jobs killed", "starts", "training went on", "records", "reports"]
-COLUMNS += ["seconds"]
-TRAIN = "--pipeline.datamanager.train-num-rays-per-batch 64 --pipeline.model.match-resolution False"
-TRAIN += " --pipeline.model.num-levels 8 --pipeline.model.log2-hashmap-size 12 --pipeline.model.max-res 64"
-TRAIN += " --pipeline.model.proposal-warmup 100 --steps-per-save 10 --evaluate-stages False"
-"""A model that takes seconds."""
+COLUMNS = ["sessions", "broken", "without markers", "SLURM jobs", "jobs killed", "starts", "trainings that went on"]
+COLUMNS += ["records", "reports", "failed with a sentence", "seconds"]
 CONFIGURATION = """
 ClusterName=test
 SlurmctldHost={host}(127.0.0.1)
@@ -133,18 +128,15 @@ class Cluster:
                     os.kill(int(entry.name), signal.SIGKILL)
 
 
-def start(cluster: Cluster, sessions: Path, out: Path, steps: int, words: Sequence[str]) -> subprocess.Popen[bytes]:
+def start(cluster: Cluster, sessions: Path, out: Path, steps: int) -> subprocess.Popen[bytes]:
     """Start the batch on the cluster; its output goes to a log."""
     command = ["hsi-sc-nerf", "batch", sessions, "--output-dir", out, "--max-num-iterations", steps]
-    command += ["--num-points", 1000, f"--train={TRAIN}", "--no-gpu"]
-    command += [*words, "--executor", "slurm", "--jobs", 8, "--slurm-status-command", "squeue"]
-    command += [
-        "--slurm-init-seconds-before-status-checks",
-        5,
-        "--default-resources",
-        "runtime=30",
-        "slurm_partition=lab",
-    ]
+    command += ["--num-points", 1000, f"--train={TRAIN} --steps-per-save 10", f"--traits={TRAITS}", "--no-gpu"]
+    command += ["--executor", "slurm", "--jobs", 8, "--slurm-status-command", "squeue"]
+    command += ["--slurm-init-seconds-before-status-checks", 5]
+    command += ["--default-resources", "runtime=30", "slurm_partition=lab"]
+    # As many jobs at once as the node has cores; steps of such small sessions do not use two.
+    command += ["--set-threads", *(f"{step}=1" for step in STEPS)]
     with out.with_suffix(".log").open("ab") as log:
         return subprocess.Popen(typed_command(command), env=cluster.environment, stdout=log, stderr=subprocess.STDOUT)
 
@@ -155,29 +147,20 @@ def give_up(out: Path) -> NoReturn:
     sys.exit("\n".join(f"{log}:\n{log.read_text(errors='replace')[-3000:]}" for log in logs))
 
 
-def main(
-    sessions: int = 3, steps: int = 60, frames: int = 8, target: str = "collect", results: Path = RESULTS
-) -> None:
+def main(steps: int = 60, results: Path = RESULTS) -> None:
     """Run the batch, and write a row.
 
     Args:
-        sessions: whole ones; a broken one comes on top.
-        steps: of each training.
-        frames: of each session.
-        target: rule of the workflow to reach.
+        steps: of each training, but for the session whose own words say otherwise.
         results: folder of the table.
     """
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        for number in range(sessions):
-            scene = override(load_scene("pear"), frames=frames, size_px=64, bands=8, seed=number)
-            simulate_session(scene, folder / "sessions" / f"pear_{number}", progress=False)
-        (folder / "sessions" / "broken" / "capture_1" / "capture").mkdir(parents=True)
-        out = folder / "out"
+        sessions, out = write_six_sessions(folder), folder / "out"
         with Cluster(folder / "cluster") as cluster:
             started, starts = time.monotonic(), 1
-            batch = start(cluster, folder / "sessions", out, steps, [target])
-            while not any(out.glob("objects/*/training/hsi-sc-nerf/run/nerfstudio_models/*.ckpt")):
+            batch = start(cluster, sessions, out, steps)
+            while not any(out.glob("objects/pear_2/training/hsi-sc-nerf/run/nerfstudio_models/*.ckpt")):
                 if batch.poll() is not None:
                     give_up(out)
                 time.sleep(0.5)
@@ -189,17 +172,16 @@ def main(
                     give_up(out)
                 starts += 1
                 print(f"{time.monotonic() - started:.0f} s: the batch ended early and is started again", flush=True)
-                batch = start(cluster, folder / "sessions", out, steps, [target])
+                batch = start(cluster, sessions, out, steps)
             seconds = time.monotonic() - started
-        plan = read_plan(out)
-        records = [read_json(one.record(step), "")["status"] for one in plan.values() for step in STEPS]
+        records = [read_json(one.record(step), "")["status"] for one in read_plan(out).values() for step in STEPS]
         went_on = sum("Going on from" in log.read_text() for log in out.glob("objects/*/logs/train.txt"))
         reports = len([*out.glob("objects/*/report.html")])
+        with (out / "traits.csv").open(newline="", encoding="utf-8") as file:
+            told = [row["object"] for row in csv.DictReader(file) if row["status"] == "failed" and row["sentence"]]
         submitted = out.with_suffix(".log").read_text().count("has been submitted with SLURM jobid")
-        row = [sessions + 1, 1, submitted, lost, starts, went_on, len(records), reports, f"{seconds:.0f}"]
-        write_results(
-            "batch_slurm", COLUMNS, [[str(cell) for cell in row]], folder=results, seed=f"0 to {sessions - 1}"
-        )
+        row = [len(OBJECTS), 1, 1, submitted, lost, starts, went_on, len(records), reports, " ".join(told)]
+        write_results("batch_slurm", COLUMNS, [[*map(str, row), f"{seconds:.0f}"]], folder=results, seed="1 to 6")
 
 
 if __name__ == "__main__":

@@ -15,9 +15,9 @@ import time
 from pathlib import Path
 
 import tyro
-from batch_slurm import TRAIN
 from results_table import RESULTS, write_results
 from rich.progress import track
+from six_sessions import TRAIN
 
 from hsi_sc_nerf.batch.plan import STEPS, read_plan
 from hsi_sc_nerf.benchmark.steps import typed_command

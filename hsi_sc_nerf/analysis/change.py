@@ -7,16 +7,32 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Int
 
 from hsi_sc_nerf.analysis.change_days import Day
 from hsi_sc_nerf.analysis.change_maps import BRIGHTNESS, SPECTRUM, Quantity, changes
 from hsi_sc_nerf.analysis.change_regions import GrownRegion, connected_to, grown_regions
 from hsi_sc_nerf.analysis.change_significance import FALSE_DISCOVERIES
 from hsi_sc_nerf.analysis.library import SpectralLibrary
-from hsi_sc_nerf.analysis.traits import Classes, classified
+from hsi_sc_nerf.analysis.traits import classified
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.indices.formula import SpectralIndex
+
+
+@dataclass(frozen=True)
+class ClassChange:
+    """The class by mixture of each vertex on two days.
+
+    Attributes:
+        names: of the classes.
+        before: number of the class on the first day; -1 in no class, or unseen.
+        after: the same on the later day; that of the first day where spectrum and brightness did not change beyond
+            noise.
+    """
+
+    names: tuple[str, ...]
+    before: Int[np.ndarray, "v"]
+    after: Int[np.ndarray, "v"]
 
 
 @dataclass(frozen=True)
@@ -30,6 +46,7 @@ class Comparison:
         earlier: name of the day before it.
         grown: regions of each quantity that had changed since the first day, on the day before and on this one.
         classes: regions of each class, on the first day and on this one; empty without a library.
+        class_map: their maps; None without a library.
     """
 
     before: str
@@ -38,6 +55,7 @@ class Comparison:
     earlier: str
     grown: Mapping[str, list[GrownRegion]]
     classes: Mapping[str, list[GrownRegion]]
+    class_map: ClassChange | None = None
 
 
 def compare_days(
@@ -72,11 +90,15 @@ def compare_days(
         for name, quantity in quantities.items():
             then = np.zeros_like(quantity.changed) if earlier is None else earlier[name].changed
             grown[name] = grown_regions(mesh, areas_m2, then, quantity.changed)
-        classes = {}
+        classes, class_map = {}, None
         if library is not None and at_first is not None:
-            now = classified(after.surface, library, angle_rad)
-            classes = _class_regions(first, at_first, now, _beyond_noise(quantities, mesh), areas_m2)
-        yield Comparison(first.name, after, quantities, before.name, grown, classes)
+            was, now = at_first.mixture_labels, classified(after.surface, library, angle_rad).mixture_labels
+            class_map = ClassChange(at_first.names, was, np.where(_beyond_noise(quantities, mesh), now, was))
+            classes = {
+                name: grown_regions(mesh, areas_m2, class_map.before == number, class_map.after == number)
+                for number, name in enumerate(class_map.names)
+            }
+        yield Comparison(first.name, after, quantities, before.name, grown, classes, class_map)
         earlier = quantities
 
 
@@ -91,18 +113,3 @@ def _beyond_noise(quantities: Mapping[str, Quantity], mesh: Mesh) -> Bool[np.nda
         told = one.changed | (one.p < FALSE_DISCOVERIES)
         beyond[connected_to(mesh, told, one.changed) if one.limit_m2 else told] = True
     return beyond
-
-
-def _class_regions(
-    first: Day,
-    before: Classes,
-    after: Classes,
-    beyond_noise: Bool[np.ndarray, "v"],
-    areas_m2: Float[np.ndarray, "v"],
-) -> dict[str, list[GrownRegion]]:
-    regions = {}
-    for number, name in enumerate(before.names):
-        was = before.mixture_labels == number
-        became = np.where(beyond_noise, after.mixture_labels == number, was)
-        regions[name] = grown_regions(first.surface.mesh, areas_m2, was, became)
-    return regions

@@ -25,6 +25,8 @@ from hsi_sc_nerf.indices.formula import SpectralIndex, index_values
 from hsi_sc_nerf.spectra import require_bands
 
 SPECTRUM, BRIGHTNESS, SURFACE = "spectrum", "brightness", "surface"
+CLASSES = "classes"
+"""Of files with maps of classes."""
 MISPLACED_M = 0.0003
 """How far two runs' spectra of one place lie apart beside the error of the registration, by blur and smoothing."""
 RIM_M = 0.006
@@ -181,7 +183,7 @@ def require_own_names(bands_nm: Sequence[float], indices: Sequence[SpectralIndex
     Raises:
         InputError: an index has the name of another quantity.
     """
-    taken = {name.casefold(): name for name in (SPECTRUM, BRIGHTNESS, SURFACE, *map(_band_name, bands_nm))}
+    taken = {name.casefold(): name for name in (SPECTRUM, BRIGHTNESS, SURFACE, CLASSES, *map(_band_name, bands_nm))}
     for index in indices:
         if other := taken.get(index.name.casefold()):
             raise InputError(

@@ -16,7 +16,16 @@ from hsi_sc_nerf.analysis.change import Comparison
 from hsi_sc_nerf.analysis.change_days import Day
 from hsi_sc_nerf.analysis.change_maps import SPECTRUM, Quantity
 from hsi_sc_nerf.analysis.change_significance import FALSE_DISCOVERIES
-from hsi_sc_nerf.analysis.pictures import GREY, SIDES_DEG, SideViews, draw_rows
+from hsi_sc_nerf.analysis.classes import UNCLASSIFIED
+from hsi_sc_nerf.analysis.pictures import (
+    GREY,
+    SIDES_DEG,
+    SideViews,
+    class_key,
+    draw_rows,
+    in_legend,
+    paint_classes,
+)
 from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.plotting import ANGLE_COLOURS, INDEX_COLOURS, STYLE, new_figure, show_image
 from hsi_sc_nerf.rendering.pictures import open_video
@@ -46,6 +55,28 @@ def draw_change(path: Path, first: Day, one: Comparison, quantity: Quantity, vie
         tested: views.on_white(np.where(np.isfinite(quantity.change)[:, None], lit, GREY), undecided),
     }
     draw_rows(path, rows, (None, None, (low, high, name), (0.0, -np.log10(_SMALLEST_P), INDEX_COLOURS)))
+
+
+@rc_context(STYLE)
+def draw_class_change(path: Path, first: Day, one: Comparison, views: SideViews) -> None:
+    """The classes on the four sides: before, after, and the new class where it is another one; grey is unseen.
+
+    Raises:
+        AssertionError: the days were compared without a library.
+    """
+    found, seen = one.class_map, first.surface.seen
+    assert found is not None
+    moved = np.where(found.after == found.before, UNCLASSIFIED, found.after)
+    rows = {
+        label: views.on_white(paint_classes(labels, seen))
+        for label, labels in (("before", found.before), ("after", found.after), ("after, where\nanother", moved))
+    }
+    there = {
+        number: in_legend(name)
+        for number, name in enumerate(found.names)
+        if (found.before == number).any() or (found.after == number).any()
+    }
+    draw_rows(path, rows, key=class_key(there, "in no class; in the last row: as before"))
 
 
 @rc_context(STYLE)

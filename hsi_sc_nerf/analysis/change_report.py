@@ -135,6 +135,7 @@ def _content(
         "settings": dict(settings),
         "first_day": comparisons[0].before,
         "repeat": None if repeat is None else _placed(repeat),
+        "classes": None if (labelled := comparisons[0].class_map) is None else list(labelled.names),
         "days": days,
         "rows": [nan_to_none(row) for row in rows],
     }
@@ -210,7 +211,8 @@ def write_change_ply(path: Path, first: Day, comparisons: Sequence[Comparison]) 
 
     Columns are named ``QUANTITY_KIND_DAY``: ``ndvi_change_1``, ``ndvi_p_1`` and ``ndvi_region_1`` of the second
     cloud. A region's number is 0 outside and negative if it is undecided. The surface's change is in metres, as all
-    lengths of the file.
+    lengths of the file. With a library there are ``class_before`` and, of the second cloud, ``class_after_1``:
+    numbers of classes, -1 for none.
     """
     extra = {}
     for day, one in enumerate(comparisons, start=1):
@@ -219,4 +221,6 @@ def write_change_ply(path: Path, first: Day, comparisons: Sequence[Comparison]) 
             extra[f"{word}_change_{day}"] = quantity.change * (1e-3 if name == SURFACE else 1.0)
             extra[f"{word}_p_{day}"] = quantity.p
             extra[f"{word}_region_{day}"] = np.where(quantity.undecided, -1.0, 1.0) * (quantity.region + 1.0)
+        if one.class_map is not None:
+            extra |= {"class_before": one.class_map.before, f"class_after_{day}": one.class_map.after}
     write_mesh(path, first.surface, {name: column.astype(np.float32) for name, column in extra.items()})

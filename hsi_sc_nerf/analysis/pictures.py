@@ -164,29 +164,39 @@ def draw_classes(
     """
     striped = unlabelled in (OUTSIDE, WITHOUT_LIMITS)
     none = surface.seen & (labels == UNCLASSIFIED)
-    colours = np.array([to_rgb(COLOURS[index % len(COLOURS)]) for index in range(len(names))])
-    painted = np.where(labels[:, None] == UNCLASSIFIED, _NEAR_WHITE, colours[labels])
-    painted[~surface.seen] = GREY
-    pictures = views.on_white(painted, none if striped else None)
+    pictures = views.on_white(paint_classes(labels, surface.seen), none if striped else None)
     height, width = pictures[0].shape[:2]
     figure = new_figure(1.9 * len(SIDES_DEG), 1.9 * height / width + 0.3 + 0.22 * (len(names) // 3 + 2))
     for axes, picture, title in zip(figure.subplots(1, len(SIDES_DEG)), pictures, SIDES_DEG, strict=True):
         show_image(axes, picture)
         axes.set_title(title)
     areas_cm2 = 1e4 * class_areas_m2(labels, surface.areas_m2, surface.seen, len(names))
-    patches = [
-        Patch(color=colours[index], label=f"{_in_legend(name)}: {area:.2f} cm²")
-        for index, (name, area) in enumerate(zip(names, areas_cm2[:-1], strict=True))
+    there = {
+        number: f"{in_legend(name)}: {area:.2f} cm²"
+        for number, (name, area) in enumerate(zip(names, areas_cm2[:-1], strict=True))
         if area > 0
-    ]
-    rest = f"{unlabelled}: {areas_cm2[-1]:.2f} cm²"
-    white = Patch(facecolor=str(_NEAR_WHITE), edgecolor="0.5", label=rest)
-    patches += [_striped(rest) if striped else white, Patch(color=str(GREY), label="not seen")]
+    }
+    patches = class_key(there, f"{unlabelled}: {areas_cm2[-1]:.2f} cm²", striped)
     figure.legend(handles=patches, loc="outside lower center", ncols=3, fontsize=8)
     save_figure(figure, path)
 
 
-def _in_legend(name: str) -> str:
+def paint_classes(labels: Int[np.ndarray, "v"], seen: Bool[np.ndarray, "v"]) -> Float[np.ndarray, "v 3"]:
+    """Colours of the classes at each vertex, near white in no class; grey is unseen."""
+    colours = np.array([to_rgb(colour) for colour in COLOURS])
+    painted = np.where(labels[:, None] == UNCLASSIFIED, _NEAR_WHITE, colours[labels % len(COLOURS)])
+    painted[~seen] = GREY
+    return painted
+
+
+def class_key(labels: Mapping[int, str], rest: str = NO_CLASS, striped: bool = False) -> list[Patch]:
+    """Legend of `paint_classes`: of the classes by their numbers, of what is in no class, and of what is unseen."""
+    patches = [Patch(color=COLOURS[number % len(COLOURS)], label=label) for number, label in labels.items()]
+    white = Patch(facecolor=str(_NEAR_WHITE), edgecolor="0.5", label=rest)
+    return [*patches, _striped(rest) if striped else white, Patch(color=str(GREY), label="not seen")]
+
+
+def in_legend(name: str) -> str:
     """A name that leaves room for the curves; matplotlib would leave away one that begins with an underscore."""
     short = name if len(name) <= _LONGEST_NAME else f"{name[: _LONGEST_NAME - 1]}…"
     return f" {short}" if short.startswith("_") else short
@@ -208,7 +218,7 @@ def draw_region_spectra(path: Path, wavelengths_nm: Float[np.ndarray, "bands"], 
         colour = "0.35" if index == 0 else COLOURS[(index - 1) % len(COLOURS)]
         mean, sd = region.spectrum.mean[order], region.spectrum.sd[order]
         axes.fill_between(nm, mean - sd, mean + sd, color=colour, alpha=0.18, linewidth=0)
-        label = f"{_in_legend(region.name)} ({region.area_m2 * 1e4:.2f} cm²)"
+        label = f"{in_legend(region.name)} ({region.area_m2 * 1e4:.2f} cm²)"
         axes.plot(nm, mean, color=colour, linewidth=1.5, marker="o" if len(nm) == 1 else None, label=label)
     axes.margins(x=0.0)
     axes.set(xlabel="wavelength (nm)", ylabel="reflectance, mean ± SD", ylim=(0, None))

@@ -79,7 +79,7 @@ class ChangeCommand:
         from hsi_sc_nerf.analysis import change_pictures, change_report
         from hsi_sc_nerf.analysis.change import compare_days
         from hsi_sc_nerf.analysis.change_days import days_on_one_mesh
-        from hsi_sc_nerf.analysis.change_maps import BRIGHTNESS, SPECTRUM, require_own_names
+        from hsi_sc_nerf.analysis.change_maps import BRIGHTNESS, CLASSES, SPECTRUM, require_own_names
         from hsi_sc_nerf.analysis.library import read_library
         from hsi_sc_nerf.analysis.pictures import SideViews
         from hsi_sc_nerf.indices.catalogue import find_indices
@@ -125,6 +125,10 @@ class ChangeCommand:
             file = f"{quantity.name.lower().replace(' ', '_')}_{day}.png"
             change_pictures.draw_change(self.output_dir / file, days[0], one, quantity, views)
             pictures[f"{quantity.name[0].upper()}{quantity.name[1:]}, {one.after.name}"] = file
+        for day, one in enumerate(comparisons if library is not None else (), 1):
+            file = f"{CLASSES}_{day}.png"
+            change_pictures.draw_class_change(self.output_dir / file, days[0], one, views)
+            pictures[f"Classes, {one.after.name}"] = file
         with console.status("film and tables"):
             shown = SPECTRUM if SPECTRUM in comparisons[0].quantities else BRIGHTNESS
             film = self.output_dir / "change.mp4"

@@ -95,6 +95,13 @@ class StagedTrainerConfig(TrainerConfig):
         stages = (self.full_frame, self.masked)
         with one_sentence():
             check_options(self)
+            if self.machine.num_devices * self.machine.num_machines != 1:
+                # Rays and random numbers follow from the step, so all processes would train on the same rays;
+                # nerfstudio has not started them yet.
+                raise InputError(
+                    "a run trains on one device; leave --machine.num-devices and --machine.num-machines at 1, and "
+                    "give each GPU a session of its own (hsi-sc-nerf batch)."
+                )
             for stage in stages:
                 for group in (*stage.frozen_groups, *stage.learn_after, *stage.group_lr):
                     if group not in self.optimizers:
@@ -132,9 +139,6 @@ class StagedTrainer(Trainer):
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Check the settings, plan the stages, and set up as nerfstudio does."""
-        if self.world_size > 1:
-            # Rays and random numbers follow from the step, so all processes would train on the same rays.
-            raise SystemExit("hsi-sc-nerf: trains on one device; leave --machine.num-devices at 1.")
         clock = self.config.train_clock if self.config.max_train_seconds else None
         wait = torch.cuda.synchronize if self.config.machine.device_type == "cuda" else None
         self.schedule = Schedule(self.config.plan(), clock, wait)

@@ -6,12 +6,13 @@ import json
 import numpy as np
 import pytest
 import trimesh
+from matplotlib.colors import to_rgb
 from results_table import RESULTS, read_results
 
 from hsi_sc_nerf.analysis.change import compare_days
 from hsi_sc_nerf.analysis.change_days import Day
 from hsi_sc_nerf.analysis.change_limit import LIMIT_M2, LIMIT_PART, limit_of_blank_m2
-from hsi_sc_nerf.analysis.change_pictures import draw_change
+from hsi_sc_nerf.analysis.change_pictures import draw_change, draw_class_change
 from hsi_sc_nerf.analysis.change_registration import Attitude
 from hsi_sc_nerf.analysis.change_report import change_rows, write_change_ply, write_tables
 from hsi_sc_nerf.analysis.library import SpectralLibrary
@@ -20,6 +21,7 @@ from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.export.cloud import read_spectral_ply
 from hsi_sc_nerf.geometry.camera import Similarity
 from hsi_sc_nerf.geometry.mesh import Mesh
+from hsi_sc_nerf.plotting import COLOURS
 from hsi_sc_nerf.simulate.materials import smooth_noise
 
 NM = np.linspace(500.0, 900.0, 5)
@@ -138,6 +140,30 @@ def test_undecided_regions_are_striped_in_the_picture(first, alone, tmp_path, mo
     draw_change(tmp_path / "brightness.png", first, one, one.quantities["brightness"], views)
     assert striped[:3] == [None] * 3
     assert np.array_equal(striped[3], one.quantities["brightness"].undecided)
+
+
+def test_maps_of_classes_differ_where_a_region_counts(first, alone, tmp_path, monkeypatch):
+    """And not where it is undecided; mesh and picture show the same."""
+    (one,) = alone
+    write_tables(tmp_path, alone, {}, {})
+    assert json.loads((tmp_path / "change.json").read_text())["classes"] == ["skin", "bruise"]
+    write_change_ply(tmp_path / "change.ply", first, alone)
+    columns, seen = read_spectral_ply(tmp_path / "change.ply").extra, first.surface.seen
+    before, after = columns["class_before"], columns["class_after_1"]
+    assert set(before[seen]) == {0.0}
+    assert set(before[~seen]) == set(after[~seen]) == {-1.0}
+    large, other = spot(LARGE_M, side=-1.0), after != before
+    assert set(after[other]) == {1.0}
+    assert other[large].mean() > 0.9
+    assert large[other].mean() > 0.9
+    views, painted = SideViews(BALL, 40), []
+    drawn = views.on_white
+    monkeypatch.setattr(views, "on_white", lambda colours: painted.append(colours) or drawn(colours))
+    draw_class_change(tmp_path / "classes.png", first, one, views)
+    skin, bruise = map(to_rgb, COLOURS[:2])
+    assert [{*map(tuple, colours[other])} for colours in painted] == [{skin}, {bruise}, {bruise}]
+    rest = seen & ~other
+    assert [{*map(tuple, colours[rest])} for colours in painted] == [{skin}, {skin}, {(0.97, 0.97, 0.97)}]
 
 
 def blanks(*fruits):

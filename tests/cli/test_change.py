@@ -97,11 +97,17 @@ def test_files_hold_the_attitudes_the_maps_and_the_film(written):
     changed = mesh.extra["brightness_region_2"] > 0
     assert np.median(mesh.extra["brightness_change_2"][changed]) < -0.3
     assert (mesh.extra["brightness_region_1"] == 0).all()
+    assert (mesh.extra["class_after_1"] == mesh.extra["class_before"]).all()
+    other = mesh.extra["class_after_2"] != mesh.extra["class_before"]
+    assert content["classes"] == [*LIBRARY]
+    assert np.mean(mesh.extra["class_after_2"][other] == LIBRARY.index("bruise")) > 0.9
+    assert changed[other].mean() > 0.8
     with av.open(str(written / "change.mp4")) as film:
         assert sum(1 for _ in film.decode(video=0)) == 75
     page = (written / "change.md").read_text()
-    assert all((written / name).is_file() for name in ("wi_1.png", "spectrum_2.png"))
+    assert all((written / name).is_file() for name in ("wi_1.png", "spectrum_2.png", "classes_2.png"))
     assert "![Spectrum, 3 friday](spectrum_2.png)" in page
+    assert "![Classes, 3 friday](classes_2.png)" in page
     assert "and repeat repeat is no change" in page
 
 
@@ -135,7 +141,7 @@ def test_a_trained_run_without_a_cloud_is_sampled_and_left_as_it_is(tmp_path, mo
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["brightness", "Surface", "spectrum", "r670", "mine"])
+@pytest.mark.parametrize("name", ["brightness", "Surface", "spectrum", "Classes", "r670", "mine"])
 def test_an_index_with_the_name_of_another_quantity_is_one_sentence(clouds, tmp_path, name):
     """One of the two would silently take the place of the other."""
     days, indices = (clouds / "monday", clouds / "friday"), (f"{name} = R800 / R600", "Mine = R900 / R600")

@@ -7,6 +7,7 @@ from unittest.mock import Mock
 import pytest
 import torch
 from clock_by_hand import time_by_hand
+from nerfstudio.configs.base_config import MachineConfig
 from nerfstudio.utils import profiler, writer
 from scipy.ndimage import distance_transform_edt
 from small_trainer import STEPS, trainer
@@ -99,6 +100,8 @@ def test_normals_are_predicted_where_an_occupancy_grid_places_the_samples(tiny_d
         ({"full_frame": StageConfig("a", 1.0, foreground_ray_fraction=1.2)}, "--full-frame.foreground-ray-fraction"),
         ({"masked": StageConfig("b", -0.5)}, "--masked.fraction is -0.5"),
         ({"masked": StageConfig("b", 1.0, lr_end=0.0)}, "--masked.lr-end is 0.0"),
+        ({"machine": MachineConfig(num_devices=2)}, "trains on one device"),
+        ({"machine": MachineConfig(num_machines=2)}, "trains on one device"),
     ],
 )
 def test_impossible_settings_are_one_sentence_before_anything_is_written(tmp_path, changes, told):
@@ -110,13 +113,6 @@ def test_impossible_settings_are_one_sentence_before_anything_is_written(tmp_pat
         with pytest.raises(SystemExit, match=rf"^hsi-sc-nerf: [^\n]*{told}[^\n]*\.$"):
             refused()
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.slow
-def test_several_devices_are_refused(tiny_dataset, tmp_path):
-    config = trainer(tiny_dataset, tmp_path).config
-    with pytest.raises(SystemExit, match="trains on one device"):
-        config.setup(local_rank=0, world_size=2).setup()
 
 
 def poison(made, bad_steps, factor=float("inf")):
