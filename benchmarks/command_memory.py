@@ -1,4 +1,4 @@
-"""Peak memory and time of every command on a session of full size.
+"""Peak memory and time of every command that reads a session, a dataset or a run, on a session of full size.
 
     uv run python benchmarks/command_memory.py --frames 6
     uv run python benchmarks/command_memory.py --frames 12
@@ -45,6 +45,7 @@ def commands(folder: Path, frames: int, size_px: int, bands: int, steps: int, po
         f"ns-export pointcloud, {points} points": (
             f"ns-export pointcloud --load-config {config} --output-dir {export} --num-points {points}"
         ),
+        "material": f"hsi-sc-nerf material {cloud} --load-config {config} --output {folder / 'material.ply'}",
         "traits": f"hsi-sc-nerf traits {cloud} --data {data} --output-dir {traits}",
         "report": (
             f"hsi-sc-nerf report {run} --output {folder / 'r.html'} --cloud {cloud} --traits {traits / 'traits.json'}"

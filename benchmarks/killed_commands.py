@@ -3,7 +3,8 @@
     uv run python benchmarks/killed_commands.py
 
 Each command works on a small simulated session. An undisturbed run of it is the reference. One half of the moments is
-spread over the command's duration, the other over the time from its first file to its end, where files can be hit.
+spread over the time until the command has written all, the other over that from its first file on, where files can be
+hit.
 
 Commands are killed (SIGKILL) and started again, which is killed, and so on, training with ``--load-dir`` as soon as
 there is a checkpoint. After some kills a command may run to its end, and must leave the same files with the same
@@ -148,23 +149,23 @@ def processor_s(process: subprocess.Popen[bytes]) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def undisturbed(command: Command, folder: Path) -> tuple[float, float]:
-    """Run a command; its processor time until its first file and until its end.
+def undisturbed(command: Command, folder: Path) -> tuple[float, float, float]:
+    """Run a command; its processor time until its first file, until all is written, and until its end.
 
     Raises:
         RuntimeError: it failed.
     """
-    process, first_file_s = start(command.words, folder), 0.0
-    while not files_in(folder / "out"):
-        first_file_s = processor_s(process)
-        if process.poll() is not None:
-            break
+    process, first_file_s, written_s, before = start(command.words, folder), 0.0, 0.0, state_of(folder)
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    while process.poll() is None:
+        used_s, state = processor_s(process), state_of(folder)
+        if state != before:
+            first_file_s, written_s, before = first_file_s or used_s, used_s, state
         time.sleep(_LOOK_EVERY_S)
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    if process.wait() != 0:
+    if process.returncode != 0:
         raise RuntimeError(f"{command.name}: {(folder / 'log').read_text()[-2000:]}")
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return first_file_s, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return first_file_s, written_s, after.ru_utime + after.ru_stime - children.ru_utime - children.ru_stime
 
 
 def killed(command: Command, folder: Path, reference: Path, expected: list[Moment]) -> Counter[str]:
@@ -264,11 +265,12 @@ def goes_on_after_ctrl_c(process: subprocess.Popen[bytes], ends_s: float = _ENDS
     return False
 
 
-def moments(count: int, first_file_s: float, seconds: float, rng: random.Random) -> Iterator[Moment]:
-    """Random moments, one in each of equal parts of a command's duration, then of the time after its first file."""
-    for writing, parts, lasts_s in ((False, count - count // 2, seconds), (True, count // 2, seconds - first_file_s)):
+def moments(count: int, first_file_s: float, written_s: float, rng: random.Random) -> Iterator[Moment]:
+    """Random moments, one in each of equal parts of the time until all is written, then from the first file on."""
+    lasts_s = {False: written_s, True: written_s - first_file_s}
+    for writing, parts in ((False, count - count // 2), (True, count // 2)):
         for part in range(parts):
-            yield Moment(lasts_s * (part + rng.random()) / parts, writing)
+            yield Moment(lasts_s[writing] * (part + rng.random()) / parts, writing)
 
 
 def main(
@@ -311,7 +313,7 @@ def main(
             if not (durations.is_file() and (inputs / command.name).is_dir()):
                 shutil.rmtree(inputs / command.name, ignore_errors=True)
                 write_json(durations, {"all": undisturbed(command, inputs / command.name)})
-            first_file_s, seconds = json.loads(durations.read_text())["all"]
+            first_file_s, written_s, seconds = json.loads(durations.read_text())["all"]
             if only not in command.name:
                 continue
             rng, reference = random.Random(f"{seed} {command.name}"), inputs / command.name
@@ -319,7 +321,7 @@ def main(
                 ("killed_commands", KILLED, kills, KILLS_IN_A_ROW, killed),
                 ("interrupted_commands", STOPPED, presses, 1, pressed),
             ):
-                expected = list(moments(count, first_file_s, seconds, rng))
+                expected = list(moments(count, first_file_s, written_s, rng))
                 if not expected:
                     continue
                 rng.shuffle(expected)

@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hsi_sc_nerf.cli.change import ChangeCommand
 from hsi_sc_nerf.cli.clouds import CompareCommand, TraitsCommand
 from hsi_sc_nerf.cli.light import MaterialCommand
 from hsi_sc_nerf.cli.sessions import InspectCommand, ProcessCommand
-from hsi_sc_nerf.cli.trained_runs import RenderCommand, ReportCommand, SampleCommand
+from hsi_sc_nerf.cli.trained_runs import ExportCommand, RenderCommand, ReportCommand, SampleCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import (
     atomic_write,
@@ -28,7 +29,9 @@ NOTHING = Path("nothing")
 @pytest.mark.parametrize(
     "command",
     [
+        lambda out: ChangeCommand((NOTHING, NOTHING), out),
         lambda out: CompareCommand(NOTHING, NOTHING, out),
+        lambda out: ExportCommand(NOTHING, out),
         lambda out: TraitsCommand(NOTHING, out),
         lambda out: MaterialCommand(NOTHING, NOTHING, output=out / "cloud.ply"),
         lambda out: SampleCommand(NOTHING, NOTHING, output=out / "cloud.ply"),

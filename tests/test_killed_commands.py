@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-from killed_commands import Command, Moment, goes_on_after_ctrl_c, in_pieces, main, moments, start
+from killed_commands import Command, Moment, goes_on_after_ctrl_c, in_pieces, main, moments, start, undisturbed
 from left_files import differences, half_written, leftovers
 
 from hsi_sc_nerf.files import atomic_write, write_json
@@ -124,3 +124,12 @@ def test_a_moment_after_the_end_does_not_come(writing, tmp_path):
     assert Moment(0.01, writing=False).comes(process, tmp_path)
     process.kill()
     process.wait()
+
+
+def test_an_undisturbed_run_has_its_moments_until_all_is_written(tmp_path, monkeypatch):
+    work = "import time, pathlib as p\ndef work(s):\n    while time.process_time() < s: pass\n"
+    work += "p.Path('out').mkdir(); work(0.3); p.Path('out/a').touch(); work(0.6); p.Path('out/b').touch(); work(1.2)"
+    monkeypatch.setattr("killed_commands.typed_command", lambda words: [sys.executable, "-c", work])
+    first_file_s, written_s, seconds = undisturbed(Command("a", ()), tmp_path)
+    assert 0.2 < first_file_s < written_s < seconds - 0.3
+    assert all(moment.after_s < written_s for moment in moments(4, first_file_s, written_s, random.Random(0)))

@@ -44,6 +44,7 @@ class ExportCommand:
         Raises:
             InputError: the run cannot be used, an option cannot be met, or the cloud cannot be written.
         """
+        require_writable(self.output_dir)
         require_dataset_of_run(self.load_config)
         from hsi_sc_nerf.export.cloud import run_name
         from hsi_sc_nerf.export.spectral_export import export_cloud

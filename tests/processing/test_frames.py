@@ -1,5 +1,6 @@
 """The files of one frame in a packed dataset, and when it counts as finished."""
 
+import hashlib
 from dataclasses import fields, replace
 
 import cv2
@@ -121,6 +122,14 @@ def test_a_damaged_note_is_not_believed(cube, tmp_path, kind):
         assert read_cache(paths, "made") is None
     getattr(paths, kind).write_bytes(whole)
     assert read_cache(paths, "made") is not None
+
+
+@pytest.mark.parametrize("damage", [(b"'descr'", b"(('desc"), (b"fingerprint", b"fingerprinx"), (b"PK", b"KP")])
+def test_a_note_that_was_damaged_before_its_digest_was_taken_is_not_believed(cube, tmp_path, damage):
+    paths, _ = process(cube, tmp_path / "data")
+    note = paths.cache.read_bytes()[hashlib.sha256().digest_size :].replace(*damage, 1)
+    paths.cache.write_bytes(hashlib.sha256(note).digest() + note)
+    assert read_cache(paths, "made") is None
 
 
 def test_a_frame_whose_pictures_cannot_be_written_has_no_cache(cube, tmp_path):
