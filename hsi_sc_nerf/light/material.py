@@ -14,8 +14,8 @@ from hsi_sc_nerf.light.fit import LEAST_IRRADIANCE, OCCLUSION_ERROR, LightFit, f
 from hsi_sc_nerf.light.stationary_light import even_directions
 from hsi_sc_nerf.light.views import TurningElements, Views, transfer
 
-RAY_DIRECTIONS = 2048
-"""Number of rays over the sphere: 4.5 degrees apart."""
+RAY_DIRECTIONS = 4096
+"""Number of rays over the sphere: 3.2 degrees apart."""
 BAND_GROUPS = 8
 """The light is fitted to this number of means of neighbouring bands: its colours are smooth."""
 NEIGHBOURS = 4
