@@ -1,8 +1,10 @@
 """Directions and functions of direction against their integrals."""
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
+from hsi_sc_nerf.light.material import RAY_DIRECTIONS
 from hsi_sc_nerf.light.stationary_light import (
     DEGREE_OF_TERM,
     LOBE_WIDTH_RAD,
@@ -44,6 +46,17 @@ def test_a_lobe_lies_around_its_middle_and_lights_what_faces_it_with_one():
     np.testing.assert_allclose((middles * towards).sum(axis=1), 1.0, atol=1e-4)
     facing = (radiance * np.maximum(directions @ towards.T, 0.0)).mean(axis=0) * 4.0
     np.testing.assert_allclose(facing, 1.0)
+
+
+def test_a_lobe_lights_as_a_lamp_far_away_and_little_beyond_the_terminator():
+    """On surfaces turned away from it; a wider lobe is found too strong."""
+    directions = even_directions(RAY_DIRECTIONS)
+    radiance = lobes(directions, np.array([[0.0, 0.6, 0.8]]))[:, 0]
+    for degrees in (0, 30, 60, 80, 90, 95, 110):
+        normal = Rotation.from_rotvec([np.deg2rad(degrees), 0.0, 0.0]).apply([0.0, 0.6, 0.8])
+        found = 4.0 * (np.maximum(directions @ normal, 0.0) * radiance).mean()
+        # Half a lobe is above the horizon of a surface at the terminator.
+        assert found == pytest.approx(max(0.0, np.cos(np.deg2rad(degrees))), abs=0.024), degrees
 
 
 def test_lobes_turn_as_their_tangents_say():
