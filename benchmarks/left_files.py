@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import dataclasses
 import json
 from pathlib import Path
@@ -96,6 +97,6 @@ def leftovers(folder: Path, reference: Path) -> list[Path]:
 
 
 def files_in(folder: Path) -> list[Path]:
-    """All files under a folder but TensorBoard's, relative to it."""
-    found = (path.relative_to(folder) for path in sorted(folder.rglob("*")) if path.is_file())
-    return [path for path in found if not path.name.startswith(NOT_COMPARED)]
+    """All files under a folder but TensorBoard's, relative to it; folders may vanish meanwhile."""
+    paths = (Path(root, name).relative_to(folder) for root, _, names in os.walk(folder) for name in names)
+    return sorted(path for path in paths if not path.name.startswith(NOT_COMPARED))

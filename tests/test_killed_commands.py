@@ -14,7 +14,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 from killed_commands import Command, Moment, goes_on_after_ctrl_c, in_pieces, main, moments, start, undisturbed
-from left_files import differences, half_written, leftovers
+from left_files import differences, files_in, half_written, leftovers
 
 from hsi_sc_nerf.files import atomic_write, write_json
 
@@ -54,6 +54,19 @@ def test_what_is_wrong_is_found(tmp_path):
     assert leftovers(found, reference) == [Path(".partial-1-b.bip")]
     (found / "a.json").write_text('{"a"')
     assert half_written(found, reference) == [Path("a.json"), Path("b.bip")]
+
+
+def test_a_folder_that_vanishes_while_files_are_listed_is_left_out(tmp_path, monkeypatch):
+    for name in ("stays", ".models-writing"):
+        write_json(tmp_path / name / "a.json", {})
+
+    def scandir(path, scan=os.scandir):
+        if str(path).endswith("-writing"):
+            raise FileNotFoundError(path)
+        return scan(path)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    assert files_in(tmp_path) == [Path("stays/a.json")]
 
 
 def test_moments_are_spread_and_repeat():
