@@ -305,8 +305,8 @@ def at_half_coverage(
     core = binary_erosion(mask, _FACES)
     relative = score / np.maximum(brightness, 1e-3)
     in_shade = (relative >= HALF_COVERED * _nearby(relative, core)) & _bright_behind(brightness, mask, ~mask)
-    rim = binary_dilation(core, _FACES) & ~core
-    too_little = (score < HALF_COVERED * _nearby(score, core)) & ~in_shade & rim
+    edge = binary_dilation(core, _FACES) & ~core
+    too_little = (score < HALF_COVERED * _nearby(score, core)) & ~in_shade & edge
     return fill_holes(mask & ~too_little)
 
 

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import ball_run
 import pytest
-from reported_run import write_page, write_run
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
@@ -24,16 +23,6 @@ from hsi_sc_nerf.report.run_sections import comparison_section, traits_section
 
 SECTIONS = ["inspection", "object", "views", "bands", "spectra", "comparison", "traits", "training"]
 SECTIONS += ["calibration", "masks", "poses", "settings"]
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    return write_run(tmp_path_factory.mktemp("report"))
-
-
-@pytest.fixture(scope="module")
-def report(run):
-    return write_page(run)
 
 
 class Page(HTMLParser):

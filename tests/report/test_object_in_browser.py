@@ -9,7 +9,6 @@ import pytest
 from headless_browser import needs_browser
 from page_of_a_ball import ball, colour_at, go_round, opened
 from PIL import Image
-from reported_run import write_page, write_run
 
 from hsi_sc_nerf.analysis.drawn_regions import (
     DrawnRegion,
@@ -23,16 +22,6 @@ from hsi_sc_nerf.report.build import object_section
 from hsi_sc_nerf.report.page import html_page
 
 pytestmark = [pytest.mark.slow, needs_browser]
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    return write_run(tmp_path_factory.mktemp("report"))
-
-
-@pytest.fixture(scope="module")
-def report(run):
-    return write_page(run)
 
 
 def picked_mm(page):
