@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
+from socket import gethostname
 from tempfile import TemporaryDirectory
 
 import tyro
@@ -20,10 +22,11 @@ from hsi_sc_nerf.batch.session_list import OBJECT, Row, read_sessions
 from hsi_sc_nerf.batch.session_steps import SessionSettings
 from hsi_sc_nerf.cli.step_words import check_words
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import read_json, require_writable
+from hsi_sc_nerf.files import make_folder, read_json, require_writable
 from hsi_sc_nerf.settings_file import check_options
 
 SNAKEFILE = Path(batch.__file__).with_name("Snakefile")
+_LOCKS = Path(".snakemake", "locks")
 _ELSEWHERE = ("--executor", "-e", "--profile", "--workflow-profile")
 """Words of Snakemake after which another than this machine, or the user's profile, says how many jobs may run."""
 
@@ -77,11 +80,9 @@ class BatchCommand(SessionSettings):
                     check_words(replace(self, process=f"{self.process} {row['process']}"))
                 except InputError as error:
                     raise InputError(f"the object {row[OBJECT]}: {error}") from error
-        if any((out / ".snakemake" / "locks").glob("*")) and not {"--unlock", "--nolock"} & {*self.other_words}:
-            raise InputError(
-                f"{out}: another batch works there, or was killed; if none runs on any machine, start this one once "
-                "with --unlock, and again."
-            )
+        locking = not {"--unlock", "--nolock"} & {*self.other_words}
+        if locking and any((out / _LOCKS).glob("*")):
+            raise _taken(out)
         settings = SessionSettings(**{name: getattr(self, name) for name in SessionSettings.__dataclass_fields__})
         if self.dry_run:
             with TemporaryDirectory() as folder:
@@ -89,8 +90,9 @@ class BatchCommand(SessionSettings):
                 write_plan(out, rows, settings, kept)
                 self._start(out, rows, kept, _stand_in(out, Path(folder) / "out"))
         else:
-            write_plan(out, rows, settings)
-            self._start(out, rows, out, out)
+            with _lock(out) if locking else nullcontext():
+                write_plan(out, rows, settings)
+                self._start(out, rows, out, out)
             _show_failures(out)
 
     def _start(self, out: Path, rows: Sequence[Row], kept: Path, directory: Path) -> None:
@@ -122,6 +124,48 @@ class BatchCommand(SessionSettings):
         words += ["--snakefile", str(SNAKEFILE.resolve()), "--directory", str(directory)]
         if _snakemake([*words, *self.other_words]) != 0:
             raise InputError(f"{out}: Snakemake ended early, see above; the same command goes on where it stopped.")
+
+
+@contextmanager
+def _lock(out: Path) -> Iterator[None]:
+    """Keep other batches out of a folder from before the plan is written, which is seconds before Snakemake does it.
+
+    The lock lies among Snakemake's own, so that its --unlock removes it. Folders made for it go with it, if nothing
+    else came to lie there.
+
+    Raises:
+        InputError: another batch has it, or the folder cannot be written to.
+    """
+    path, owner = out / _LOCKS / "plan.lock", f"{gethostname()} {os.getpid()}\n"
+    made = [folder for folder in (path.parent, path.parent.parent, out) if not folder.exists()]
+    make_folder(path.parent)
+    try:
+        # Only one of two machines on a shared folder succeeds with it.
+        with path.open("x", encoding="utf-8") as file:
+            file.write(owner)
+    except FileExistsError as error:
+        raise _taken(out) from error
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror}); free some space or choose another folder."
+        ) from error
+    try:
+        yield
+    finally:
+        # Snakemake removes all locks at its end; by now this one can be that of the next batch.
+        with suppress(FileNotFoundError):
+            if path.read_text(encoding="utf-8") == owner:
+                path.unlink()
+        for folder in made:
+            with suppress(OSError):
+                folder.rmdir()
+
+
+def _taken(out: Path) -> InputError:
+    return InputError(
+        f"{out}: another batch works there, or was killed; if none runs on any machine, start this one once with "
+        "--unlock, and again."
+    )
 
 
 def _stand_in(out: Path, folder: Path) -> Path:

@@ -111,6 +111,44 @@ def test_words_of_snakemake_reach_it_unchanged_after_ours(tmp_path, monkeypatch)
     assert ["all" in one for one in found] == [True, False, False]
 
 
+def test_two_started_at_once_do_not_harm_each_other(tmp_path, monkeypatch):
+    """The second comes before Snakemake of the first has its lock: it is refused, and the list stays the first's."""
+    out = tmp_path / "out"
+    for name in ("first", "second"):
+        make_sessions(tmp_path / name / "sessions", [name])
+    refused = []
+
+    def snakemake(given):
+        before = files(out)
+        for more in ([], ["--preset", "best"], ["--dry-run"]):
+            monkeypatch.setattr(
+                sys, "argv", ["hsi-sc-nerf", *words(tmp_path / "second", *more), "--output-dir", str(out)]
+            )
+            with pytest.raises(SystemExit):
+                main()
+            refused.append(files(out) == before)
+        return 0
+
+    monkeypatch.setattr(batch, "_snakemake", snakemake)
+    monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", *words(tmp_path / "first"), "--output-dir", str(out)])
+    main()
+    assert refused == [True, True, True]
+    assert "first" in (out / "sessions.csv").read_text()
+    assert not list(out.rglob("*.lock"))
+
+
+def test_what_is_refused_leaves_no_lock_and_no_folder(tmp_path, monkeypatch):
+    sessions = make_sessions(tmp_path / "sessions", ["a"])
+    inside = sessions / "a" / "out"
+    with pytest.raises(InputError, match="lies in the session"):
+        BatchCommand(sessions=sessions, output_dir=inside).main()
+    assert not inside.exists()
+    monkeypatch.setattr(batch, "_snakemake", lambda given: 1)
+    for _ in range(2):  # the second time it is no longer said that another batch works there
+        with pytest.raises(InputError, match="Snakemake ended early"):
+            BatchCommand(sessions=sessions, output_dir=tmp_path / "out").main()
+
+
 @pytest.mark.slow
 def test_six_sessions_of_which_two_fail(tmp_path, monkeypatch, capfd):
     """First the plan; then all; then nothing; then what was mended; then what was asked for."""
