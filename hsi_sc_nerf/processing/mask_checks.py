@@ -181,11 +181,12 @@ def _hull(
         )
         return [Finding("masks-hull", "red", sentence, {"contradiction": typical})]
     excess = MAX_ODDITY + 0.125 * pixel
-    odd, contradiction = _odd(masks, silhouettes, brightness, excess)
+    odd, contradiction = _odd(masks, silhouettes, contradiction, brightness, excess)
     if not odd.any():
         return []
     # The outermost frames of a part of a turn carve alone and are outvoted, but the core agrees with all masks.
-    odd_to_core, to_core = _odd(masks, hull.core_silhouettes, brightness, excess)
+    core = hull.core_silhouettes
+    odd_to_core, to_core = _odd(masks, core, _contradiction(masks, core), brightness, excess)
     if not odd_to_core.any() and np.median(to_core[filled]) <= typical:
         return []
     others = {name: float(c) for name, c, is_odd in zip(names, contradiction, odd, strict=True) if is_odd}
@@ -199,16 +200,20 @@ def _hull(
 def _odd(
     masks: Bool[np.ndarray, "frames h w"],
     silhouettes: Bool[np.ndarray, "frames h w"],
+    contradiction: Float[np.ndarray, "frames"],
     brightness: Float[np.ndarray, "frames h w"],
     excess: float,
 ) -> tuple[Bool[np.ndarray, "frames"], Float[np.ndarray, "frames"]]:
-    """Which masks differ by ``excess`` more from their silhouettes than a typical one, and by how much all differ."""
+    """Which masks contradict their silhouettes by ``excess`` more than a typical one; contradiction without noise.
+
+    Args:
+        contradiction: of the masks and their silhouettes, noise included.
+    """
     filled = masks.any(axis=(1, 2))
-    differences = _contradiction(masks, silhouettes)[filled]
-    scatter = float(median_abs_deviation(differences, scale="normal"))
-    contradiction = _contradiction(masks & ~_background(masks, silhouettes, brightness), silhouettes)
-    limit = float(np.median(differences)) + max(excess, ODDITY_SIGMAS * scatter)
-    return (contradiction > limit) & filled, contradiction
+    scatter = float(median_abs_deviation(contradiction[filled], scale="normal"))
+    limit = float(np.median(contradiction[filled])) + max(excess, ODDITY_SIGMAS * scatter)
+    trimmed = _contradiction(masks & ~_background(masks, silhouettes, brightness), silhouettes)
+    return (trimmed > limit) & filled, trimmed
 
 
 def _background(
