@@ -1,5 +1,6 @@
 """The benchmarks: tables that say where each row comes from, damaged files, the path-traced session, stand-ins."""
 
+import csv
 import os
 import random
 import subprocess
@@ -21,6 +22,9 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.processing.process import process_session
 
+ROOT = Path(__file__).parents[1]
+with (ROOT / "benchmarks" / "mutations.csv").open(encoding="utf-8", newline="") as table:
+    MUTATIONS = list(csv.DictReader(table))
 COLUMNS = ["object", "method", "error, mm"]
 OLD = {"commit": "aaaaaaa", "machine": "old machine", "seed": "1"}
 
@@ -199,3 +203,10 @@ def test_frames_by_the_stand_in_equal_open3d(tmp_path, monkeypatch):
         difference = np.abs(found["counts"].astype(int) - expected["counts"].astype(int))
     # A ray along the edge of two triangles may go to either.
     assert (difference > 1).mean() < 1e-3
+
+
+@pytest.mark.parametrize("row", MUTATIONS, ids=lambda row: f"{row['function']}, {row['broken by']}")
+def test_what_the_mutations_break_is_there_once_and_so_are_its_tests(row):
+    text = (ROOT / "hsi_sc_nerf" / f"{row['module']}.py").read_text(encoding="utf-8")
+    assert text.count(row["text"].replace("\\n", "\n")) == 1
+    assert all((ROOT / "tests" / test).is_file() for test in row["tests"].split())
