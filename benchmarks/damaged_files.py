@@ -256,7 +256,7 @@ def main(
     Args:
         inputs: of all kinds together.
         seed: of the damages.
-        only: part of the names of the kinds to run, each with its fraction of inputs; other rows are kept.
+        only: the kind to run, or part of the names of several, each with its fraction of inputs; other rows are kept.
         keep: folder for inputs that were neither refused nor read in time and memory.
         progress: folder for what was counted so far, after each input; of the same inputs and seed.
         results: folder of the table.
@@ -264,7 +264,7 @@ def main(
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "valid"
         every_kind = kinds(folder)
-        found = [kind for kind in every_kind if only in kind.name]
+        found = [kind for kind in every_kind if kind.name == only] or [kind for kind in every_kind if only in kind.name]
         for kind in found:  # valid, and compiled and imported before memory is watched
             kind.read()
         used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
