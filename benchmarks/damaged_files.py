@@ -264,7 +264,8 @@ def main(
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "valid"
         every_kind = kinds(folder)
-        found = [kind for kind in every_kind if kind.name == only] or [kind for kind in every_kind if only in kind.name]
+        alike = [kind for kind in every_kind if only in kind.name]
+        found = [kind for kind in alike if kind.name == only] or alike
         for kind in found:  # valid, and compiled and imported before memory is watched
             kind.read()
         used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
