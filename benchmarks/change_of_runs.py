@@ -27,7 +27,7 @@ from rich.progress import track
 from scipy.spatial import cKDTree
 from true_object import TrueObject
 
-from hsi_sc_nerf.analysis.change import Comparison, compare_days
+from hsi_sc_nerf.analysis.change import DayComparison, compare_days
 from hsi_sc_nerf.analysis.change_days import Day, days_on_one_mesh
 from hsi_sc_nerf.analysis.change_maps import BRIGHTNESS
 from hsi_sc_nerf.benchmark.steps import run_step, typed_command
@@ -110,7 +110,7 @@ class ChangeOfRuns:
     def _fruit(self, seed: int, day: SetDown) -> TrueObject:
         return fruit_of(day, NM, self.kind, seed, self.height_m)
 
-    def _row(self, fruit: int, one: Comparison, repeat: Day | None, name: str = "") -> list[str]:
+    def _row(self, fruit: int, one: DayComparison, repeat: Day | None, name: str = "") -> list[str]:
         day, attitude, brightness = DAYS[one.after.name], one.after.attitude, one.quantities[BRIGHTNESS]
         assert attitude is not None
         grew = by_brightness = ""
@@ -185,7 +185,7 @@ def on_the_table(fruit: TrueObject) -> Float[np.ndarray, "v 3"]:
     return placed + np.array([-centre[0], -centre[1], STAND_M - placed[:, 2].min()])
 
 
-def _undecided_cm2(one: Comparison, far: Bool[np.ndarray, "v"]) -> dict[str, float]:
+def _undecided_cm2(one: DayComparison, far: Bool[np.ndarray, "v"]) -> dict[str, float]:
     """Area of the largest undecided region of each quantity that lies away from what changed; 0 for none."""
     areas_m2, largest = one.after.surface.areas_m2, {}
     for name, quantity in one.quantities.items():

@@ -37,7 +37,7 @@ from hsi_sc_nerf.light.elements import LARGEST_INCIDENCE_DEG, Elements, observe,
 from hsi_sc_nerf.light.fit import WHITE_STD
 from hsi_sc_nerf.light.material import light_on_object, turning_elements
 from hsi_sc_nerf.light.of_run import ShadingEvidence, light_of_run, shading_evidence
-from hsi_sc_nerf.light.views import Views
+from hsi_sc_nerf.light.views import ElementViews
 from hsi_sc_nerf.models.trained_run import open_run
 from hsi_sc_nerf.processing.visual_hull import DISC_OVER_MARKERS
 from hsi_sc_nerf.simulate.effects.light import Lamp
@@ -166,7 +166,7 @@ def judge_true_mesh(truth: Truth, container_m: tuple[float, float], *, even: boo
         capture = truth.captures[frame]
         return truth.reflectance(capture) if of_material else truth.light(capture).radiance()
 
-    def observed(some: Elements, *, of_material: bool) -> Views:
+    def observed(some: Elements, *, of_material: bool) -> ElementViews:
         return observe(
             some,
             poses,

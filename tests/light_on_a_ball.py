@@ -4,7 +4,7 @@ import numpy as np
 import scipy.sparse
 
 from hsi_sc_nerf.light.stationary_light import even_directions
-from hsi_sc_nerf.light.views import Transfer, TurningElements, Views
+from hsi_sc_nerf.light.views import ElementViews, Transfer, TurningElements
 
 DIRECTIONS = even_directions(2048)
 TO_LAMP = np.array([-0.5, 0.55, 0.67]) / np.linalg.norm([-0.5, 0.55, 0.67])
@@ -52,4 +52,4 @@ def measured(ball, lamp, seed=0, noise=0.005, lamp_colour=(1.0, 1.0), distance_m
     element, irradiance = np.concatenate(element), np.concatenate(irradiance)
     shown = material[element] * irradiance * (1.0 + noise * rng.standard_normal((len(element), 1)))
     of_object, no_std = np.ones(len(element), bool), np.zeros(len(element))
-    return Views(element, np.concatenate(frame), shown, of_object, no_std), irradiance, material
+    return ElementViews(element, np.concatenate(frame), shown, of_object, no_std), irradiance, material

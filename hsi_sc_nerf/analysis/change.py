@@ -36,7 +36,7 @@ class ClassChange:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class DayComparison:
     """A day beside the first one, and its areas beside those of the day before it.
 
     Attributes:
@@ -66,7 +66,7 @@ def compare_days(
     library: SpectralLibrary | None = None,
     angle_rad: float = np.inf,
     repeat: Day | None = None,
-) -> Iterable[Comparison]:
+) -> Iterable[DayComparison]:
     """Compare each day with the first, one after the other.
 
     Args:
@@ -98,7 +98,7 @@ def compare_days(
                 name: grown_regions(mesh, areas_m2, class_map.before == number, class_map.after == number)
                 for number, name in enumerate(class_map.names)
             }
-        yield Comparison(first.name, after, quantities, before.name, grown, classes, class_map)
+        yield DayComparison(first.name, after, quantities, before.name, grown, classes, class_map)
         earlier = quantities
 
 

@@ -91,7 +91,7 @@ def find_attitude(
     Raises:
         InputError: the objects do not fit, differ too much in size, or fit in two attitudes equally well.
     """
-    (coarse, fine), (thinned, target) = moving, (_Target(one) for one in reference)
+    (coarse, fine), (thinned, target) = moving, (_FixedSample(one) for one in reference)
     found = [_fitted(coarse, thinned, start, COARSE_ROUNDS) for start in track(_starts(coarse, thinned.sample))]
     scales = _scales(coarse, thinned, min(found, key=lambda one: _loss(coarse, thinned, one, None).mean()))
     found.sort(key=lambda one: _loss(coarse, thinned, one, scales).mean())
@@ -118,7 +118,7 @@ def find_attitude(
     return best
 
 
-class _Target:
+class _FixedSample:
     """The reference's sample with its search tree and the gradients of its features along the surface."""
 
     def __init__(self, sample: SurfaceSample) -> None:
@@ -155,7 +155,7 @@ def _distinct(ranked: Sequence[Similarity]) -> list[Similarity]:
     return kept
 
 
-def _fitted(moving: SurfaceSample, target: _Target, start: Similarity, rounds: int) -> Similarity:
+def _fitted(moving: SurfaceSample, target: _FixedSample, start: Similarity, rounds: int) -> Similarity:
     transform = start
     for _ in range(rounds):
         matrix, gradients, centre = _system(moving, target, transform)
@@ -169,7 +169,7 @@ def _fitted(moving: SurfaceSample, target: _Target, start: Similarity, rounds: i
 
 
 def _system(
-    moving: SurfaceSample, target: _Target, transform: Similarity
+    moving: SurfaceSample, target: _FixedSample, transform: Similarity
 ) -> tuple[Float[np.ndarray, "7 7"], Float[np.ndarray, "n 7"], Float[np.ndarray, "3"]]:
     """Normal matrix and each point's gradient of the loss by shift, turn and growth about the centre, and that."""
     points = transform(moving.points)
@@ -188,13 +188,13 @@ def _system(
     return matrix, np.einsum("nfi,nf->ni", jacobian, weight * residual), centre
 
 
-def _scales(moving: SurfaceSample, target: _Target, transform: Similarity) -> Float[np.ndarray, "1+f"]:
+def _scales(moving: SurfaceSample, target: _FixedSample, transform: Similarity) -> Float[np.ndarray, "1+f"]:
     residual, _, paired = target.residuals(transform(moving.points), moving.features)
     return robust_std(residual[paired], axis=0, least=_LEAST_SCATTER)
 
 
 def _loss(
-    moving: SurfaceSample, target: _Target, transform: Similarity, scales: Float[np.ndarray, "1+f"] | None
+    moving: SurfaceSample, target: _FixedSample, transform: Similarity, scales: Float[np.ndarray, "1+f"] | None
 ) -> Float[np.ndarray, "n"]:
     """Tukey's loss of each point, 1 for a lost one; without scales, in units of the whole reference's spread."""
     residual, _, paired = target.residuals(transform(moving.points), moving.features)
@@ -207,7 +207,7 @@ def _loss(
     return np.where(paired, loss.mean(axis=1), 1.0)
 
 
-def _attitude(moving: SurfaceSample, target: _Target, ranked: Sequence[Similarity]) -> Attitude:
+def _attitude(moving: SurfaceSample, target: _FixedSample, ranked: Sequence[Similarity]) -> Attitude:
     best = ranked[0]
     matrix, gradients, _ = _system(moving, target, best)
     block = _blocks(moving.points)

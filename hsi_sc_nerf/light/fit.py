@@ -29,7 +29,7 @@ from hsi_sc_nerf.light.stationary_light import (
     tangents,
     unit_irradiance,
 )
-from hsi_sc_nerf.light.views import LampUnits, TurningElements, Views
+from hsi_sc_nerf.light.views import ElementViews, LampUnits, TurningElements
 from hsi_sc_nerf.robust_scatter import robust_std
 
 MOST_LAMPS = 4
@@ -92,7 +92,7 @@ class LightFit:
     relative_std: Float[np.ndarray, "m"]
 
 
-def fit_light(elements: TurningElements, views: Views, white_normal: Float[np.ndarray, "3"]) -> LightFit:
+def fit_light(elements: TurningElements, views: ElementViews, white_normal: Float[np.ndarray, "3"]) -> LightFit:
     """Fit light and materials.
 
     Args:
@@ -100,7 +100,7 @@ def fit_light(elements: TurningElements, views: Views, white_normal: Float[np.nd
         views: their measurements.
         white_normal: outward unit normal of the white reference, camera's frame.
     """
-    fit = _Fit(elements, views, white_normal)
+    fit = _LightFitting(elements, views, white_normal)
     fit.converge()
     while len(fit.light.lamps) < MOST_LAMPS:
         before = fit.state()
@@ -119,10 +119,10 @@ def fit_light(elements: TurningElements, views: Views, white_normal: Float[np.nd
     return fit.result()
 
 
-class _Fit:
+class _LightFitting:
     """State of the fit: the light, and what follows from it."""
 
-    def __init__(self, elements: TurningElements, views: Views, white: np.ndarray) -> None:
+    def __init__(self, elements: TurningElements, views: ElementViews, white: np.ndarray) -> None:
         self.elements, self.views, self.white = elements, views, white
         count = len(views.element), len(elements.positions)
         entries = np.ones(count[0]), (views.element, np.arange(count[0]))

@@ -18,7 +18,7 @@ from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.light.elements import observe, spread_elements, support_mesh
 from hsi_sc_nerf.light.fit import LightFit
 from hsi_sc_nerf.light.material import ObjectLight, light_on_object, turning_elements
-from hsi_sc_nerf.light.views import TurningElements, Views
+from hsi_sc_nerf.light.views import ElementViews, TurningElements
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.processing.view_changes import like_spectra
@@ -168,7 +168,7 @@ class ShadingEvidence:
         return turning or profile
 
 
-def shading_evidence(elements: TurningElements, views: Views, fit: LightFit) -> ShadingEvidence:
+def shading_evidence(elements: TurningElements, views: ElementViews, fit: LightFit) -> ShadingEvidence:
     """Look for uneven light.
 
     Args:

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, UInt8, UInt16
 from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import read_json, read_picture, write_json
-from hsi_sc_nerf.findings import Effect
+from hsi_sc_nerf.findings import EffectEvidence
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.packed.cube import ReflectanceUncertainty
 from hsi_sc_nerf.settings_file import read_dataclass
@@ -140,7 +140,7 @@ class PackedDataset:
     typical_uncertainty: Float[np.ndarray, "bands"] | None = None
     pose_method: str | None = None
     fingerprint: str | None = None
-    effects: tuple[Effect, ...] = ()
+    effects: tuple[EffectEvidence, ...] = ()
 
     def __repr__(self) -> str:
         camera, nm = self.intrinsics, self.wavelengths_nm
@@ -320,13 +320,13 @@ def _parse_transforms(root: Path, content: dict[str, Any], source: str) -> Packe
     )
 
 
-def _parse_effect(content: dict[str, Any]) -> Effect:
+def _parse_effect(content: dict[str, Any]) -> EffectEvidence:
     def number(name: str) -> float | None:
         return None if content[name] is None else float(content[name])
 
     name, unit, sentence = (str(content[key]) for key in ("name", "unit", "sentence"))
     evidence, noise, threshold = map(number, ("evidence", "noise", "threshold"))
-    return Effect(name, bool(content["present"]), evidence, noise, threshold, unit, sentence)
+    return EffectEvidence(name, bool(content["present"]), evidence, noise, threshold, unit, sentence)
 
 
 def _parse_frame(root: Path, frame: dict[str, Any]) -> PackedFrame:

@@ -16,7 +16,7 @@ from hsi_sc_nerf.plotting import ANGLE_COLOURS, ANGLE_DRAWN_RAD, ERROR_DRAWN, co
 from hsi_sc_nerf.report.charts import Curve, line_chart
 from hsi_sc_nerf.report.held_out_views import (
     HeldOutView,
-    PointSpectra,
+    PixelSpectra,
     ViewScores,
     mean_and_sd,
     object_angles,
@@ -244,7 +244,7 @@ def spectra_section(view: HeldOutView, wavelengths_nm: Float[np.ndarray, "bands"
     return Section("spectra", "Spectra", blocks, judge_spectra(points))
 
 
-def judge_spectra(points: Mapping[str, PointSpectra]) -> list[Finding]:
+def judge_spectra(points: Mapping[str, PixelSpectra]) -> list[Finding]:
     """How far rendered mean spectra are from the measured ones, by the points' letters."""
     errors = {
         letter: float(np.nanmean(np.abs(one.rendered - one.measured)) / np.nanmean(one.measured))

@@ -37,7 +37,7 @@ class Surroundings:
     form_factors: scipy.sparse.csr_array
 
 
-class Surface:
+class SceneSurface:
     """Points on all parts, one for each vertex, and several where facets meet at a crease.
 
     Attributes:

@@ -13,7 +13,7 @@ from hsi_sc_nerf.simulate.light import Lighting, colour_spectra, even_light, ren
 from hsi_sc_nerf.simulate.mesh import cylinder, quads, revolve
 from hsi_sc_nerf.simulate.render import Part, Renderer
 from hsi_sc_nerf.simulate.scene import load_scene, override
-from hsi_sc_nerf.simulate.surface import Surface, cosine_directions, split_at_creases
+from hsi_sc_nerf.simulate.surface import SceneSurface, cosine_directions, split_at_creases
 
 RADIUS_M = 0.03
 CAMERA = PinholeIntrinsics(24, 24, 60.0, 60.0, 12.0, 12.0)
@@ -165,7 +165,7 @@ def wall_and_floor(height_m=0.1):
     ]
     floor = Mesh(np.concatenate(rows), np.array(triangles))
     wall = quads(np.array([[[0.0, 20.0, 0.0], [0.0, 20.0, height_m], [0.0, -20.0, height_m], [0.0, -20.0, 0.0]]]))
-    surface = Surface(Renderer([part(floor, "floor"), part(wall, "wall")]))
+    surface = SceneSurface(Renderer([part(floor, "floor"), part(wall, "wall")]))
     points = np.argsort(surface.vertex)
     hidden = 0.5 * (1.0 - DISTANCES_M / np.hypot(DISTANCES_M, height_m))
     return surface, points[8:14], points[21:], hidden
