@@ -37,7 +37,7 @@ from hsi_sc_nerf.indices.catalogue import find_indices
 from hsi_sc_nerf.simulate.render import Part
 from hsi_sc_nerf.simulate.scene import OwnMesh, load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
-from hsi_sc_nerf.simulate.truth import write_mesh
+from hsi_sc_nerf.simulate.truth import write_true_mesh
 
 BANDS, FRAMES, SIZE_PX, POINTS = 25, 36, 128, 200_000
 EVERY = 4
@@ -150,7 +150,7 @@ class ChangeOfRuns:
             folder.mkdir(parents=True, exist_ok=True)
             fruit = self._fruit(seed, day)
             placed = Mesh(set_down(day, fruit.mesh.vertices)(fruit.mesh.vertices), fruit.mesh.triangles)
-            write_mesh(folder / "fruit.ply", Part(placed, fruit.materials, fruit.weights))
+            write_true_mesh(folder / "fruit.ply", Part(placed, fruit.materials, fruit.weights))
             own = OwnMesh("mesh", folder / "fruit.ply", fruit.materials)
             scene = replace(load_scene("apple"), object=own, materials=dried_materials(day, self.kind))
             scene = override(scene, frames=FRAMES, size_px=SIZE_PX, bands=BANDS, seed=10 * seed + at, effects=EFFECTS)

@@ -38,7 +38,7 @@ from hsi_sc_nerf.light.fit import WHITE_STD
 from hsi_sc_nerf.light.material import light_on_object, turning_elements
 from hsi_sc_nerf.light.of_run import ShadingEvidence, light_of_run, shading_evidence
 from hsi_sc_nerf.light.views import ElementViews
-from hsi_sc_nerf.models.trained_run import open_run
+from hsi_sc_nerf.models.trained_run import open_trained_run
 from hsi_sc_nerf.processing.visual_hull import DISC_OVER_MARKERS
 from hsi_sc_nerf.simulate.effects.light import Lamp
 from hsi_sc_nerf.simulate.truth import Truth, load_truth
@@ -200,7 +200,7 @@ def judge_true_mesh(truth: Truth, container_m: tuple[float, float], *, even: boo
 
 def judge_run(truth: Truth, config: Path, cloud_path: Path) -> Judged:
     """The light on a run's surface, and the spectra of its cloud."""
-    run, cloud = open_run(config), read_spectral_ply(cloud_path)
+    run, cloud = open_trained_run(config), read_spectral_ply(cloud_path)
     started = time.process_time()
     found = light_of_run(run, facing_of(truth))
     seconds, surface = time.process_time() - started, TrueObject.of(truth)

@@ -15,7 +15,7 @@ import numpy as np
 from hsi_sc_nerf.analysis.change import DayComparison
 from hsi_sc_nerf.analysis.change_days import Day
 from hsi_sc_nerf.analysis.change_maps import SPECTRUM, SURFACE
-from hsi_sc_nerf.analysis.spectral_mesh import write_mesh
+from hsi_sc_nerf.analysis.spectral_mesh import write_spectral_mesh
 from hsi_sc_nerf.files import atomic_write, nan_to_none, write_json
 from hsi_sc_nerf.terminal import markdown_table, markdown_text
 
@@ -73,7 +73,7 @@ def _areas(before_m2: float, after_m2: float, centre_m: Sequence[float] = ()) ->
     return told | dict(zip(("x_mm", "y_mm", "z_mm"), (1e3 * x for x in centre_m), strict=False))
 
 
-def write_tables(
+def write_change_tables(
     folder: Path,
     comparisons: Sequence[DayComparison],
     settings: Mapping[str, Any],
@@ -223,4 +223,4 @@ def write_change_ply(path: Path, first: Day, comparisons: Sequence[DayComparison
             extra[f"{word}_region_{day}"] = np.where(quantity.undecided, -1.0, 1.0) * (quantity.region + 1.0)
         if one.class_map is not None:
             extra |= {"class_before": one.class_map.before, f"class_after_{day}": one.class_map.after}
-    write_mesh(path, first.surface, {name: column.astype(np.float32) for name, column in extra.items()})
+    write_spectral_mesh(path, first.surface, {name: column.astype(np.float32) for name, column in extra.items()})

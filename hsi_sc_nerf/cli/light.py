@@ -61,7 +61,7 @@ class MaterialCommand:
         from hsi_sc_nerf.export.formats import format_of, require_format, write_cloud
         from hsi_sc_nerf.files import require_writable, write_json
         from hsi_sc_nerf.light.of_run import light_of_run
-        from hsi_sc_nerf.models.trained_run import open_run
+        from hsi_sc_nerf.models.trained_run import open_trained_run
 
         output = self.output or self.cloud.with_name(f"{self.cloud.stem}-material.ply")
         require_writable(output.parent)
@@ -69,7 +69,7 @@ class MaterialCommand:
         cloud = read_spectral_ply(self.cloud)
         extra = {*cloud.extra, *LIGHT_COLUMNS, *band_property_names(cloud.wavelengths_nm, "material")}
         require_format(stem, file_format, len(cloud.wavelengths_nm), len(extra))
-        run = open_run(self.load_config)
+        run = open_trained_run(self.load_config)
         require_bands_of_run(cloud, run.model.wavelengths_nm, str(self.cloud))
         found = light_of_run(run, self._white_normal())
         corrected = self.correct == "always" or (self.correct == "auto" and found.evidence.shaded)

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float, Int
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.findings import CERTAIN
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.light.elements import observe, spread_elements, support_mesh
 from hsi_sc_nerf.light.fit import LightFit
@@ -36,8 +37,6 @@ LEAST_VIEWS = 200
 """Fewer measurements do not determine the light."""
 LEAST_UNEVENNESS = 0.01
 """Irradiance that varies by less over the object changes no result."""
-CERTAIN = 3.0
-"""Standard deviations by which an effect must exceed its noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +91,7 @@ def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"]) -> RunLi
         InputError: the run holds no object, or no frame sees enough of it.
 
     Example:
-        >>> found = light_of_run(open_run(Path("config.yml")), np.array([0.0, 0.0, 1.0]))
+        >>> found = light_of_run(open_trained_run(Path("config.yml")), np.array([0.0, 0.0, 1.0]))
         >>> irradiance, std = found.irradiance(cloud.points)
     """
     sampler, dataset = run.manager.train_pixel_sampler, run.dataset

@@ -123,7 +123,7 @@ def score_view(
     )
 
 
-def mean_and_sd(
+def sample_mean_and_sd(
     values: Float[np.ndarray, "n bands"],
 ) -> tuple[Float[np.ndarray, "bands"], Float[np.ndarray, "bands"]]:
     """Mean and standard deviation of a sample (one degree of freedom less) over the first axis, without NaN.
@@ -193,6 +193,6 @@ def point_spectra(
     for line, sample in points:
         inside = mask & ((lines - line) ** 2 + (samples - sample) ** 2 <= radius_px**2)
         here = measured[inside].astype(float)
-        mean_rendered, _ = mean_and_sd(np.where(np.isfinite(here), rendered[inside], np.nan))
-        found.append(PixelSpectra(line, sample, int(inside.sum()), *mean_and_sd(here), mean_rendered))
+        mean_rendered, _ = sample_mean_and_sd(np.where(np.isfinite(here), rendered[inside], np.nan))
+        found.append(PixelSpectra(line, sample, int(inside.sum()), *sample_mean_and_sd(here), mean_rendered))
     return found

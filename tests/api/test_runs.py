@@ -62,7 +62,7 @@ def test_points_have_the_spectrum_of_the_ball_and_points_beside_it_none(run, mon
 
 @pytest.mark.slow
 def test_a_frame_is_rendered_as_the_command_renders_it(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(trained_run, "open_run", lambda _: run.trained)
+    monkeypatch.setattr(trained_run, "open_trained_run", lambda _: run.trained)
     RenderCommand(tmp_path / "config.yml", tmp_path / "command").main()
     (name,) = (path.stem for path in (tmp_path / "command").glob("ball_?.hdr"))
     view = run.render(name)

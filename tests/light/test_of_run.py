@@ -18,7 +18,7 @@ from hsi_sc_nerf.export.formats import write_cloud
 from hsi_sc_nerf.geometry.camera import pixel_rays
 from hsi_sc_nerf.light.fit import fit_light
 from hsi_sc_nerf.light.of_run import light_of_run, shading_evidence
-from hsi_sc_nerf.models.trained_run import open_run
+from hsi_sc_nerf.models.trained_run import open_trained_run
 from hsi_sc_nerf.packed.cube import pack, write_packed_cube
 from hsi_sc_nerf.packed.dataset import open_packed
 
@@ -47,7 +47,7 @@ def open_lit_ball(root, lit):
         reflectance = np.broadcast_to(factory.BACKGROUND, (*mask.shape, factory.BANDS)).copy()
         reflectance[mask] = factory.PLANT * irradiance(normals, frame.camera_to_world)[:, None]
         write_packed_cube(frame.cube_path, pack(reflectance), factory.WAVELENGTHS_NM)
-    run = open_run(ball_run.write_untrained_run(root / "data", root / "runs"))
+    run = open_trained_run(ball_run.write_untrained_run(root / "data", root / "runs"))
     ball_run.fill_with_ball(run)
     return run
 

@@ -150,7 +150,7 @@ def test_what_cannot_be_rendered_is_refused_before_anything_is_loaded(tmp_path):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, dataset):
-    opened = trained_run.open_run(ball_run.write_untrained_run(dataset.root, tmp_path_factory.mktemp("runs")))
+    opened = trained_run.open_trained_run(ball_run.write_untrained_run(dataset.root, tmp_path_factory.mktemp("runs")))
     ball_run.fill_with_ball(opened)
     return opened
 
@@ -165,7 +165,7 @@ def silhouette(pose, lens=factory.INTRINSICS):
 
 @pytest.mark.slow
 def test_a_ball_is_rendered_as_it_was_measured(tmp_path, run, monkeypatch):
-    monkeypatch.setattr(trained_run, "open_run", lambda _: run)
+    monkeypatch.setattr(trained_run, "open_trained_run", lambda _: run)
     RenderCommand(tmp_path, tmp_path / "out", video=("pseudo-RGB",)).main()
     names = {path.name for path in (tmp_path / "out").iterdir()}
     of_view = {HELD_OUT + end for end in (".hdr", ".raw", ".png", "_valid.hdr", "_valid.raw")}
@@ -189,7 +189,7 @@ def test_a_ball_is_rendered_as_it_was_measured(tmp_path, run, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["float32", "uint16"])
 def test_views_of_the_material_show_the_cloud_that_tells_it(tmp_path, run, monkeypatch, kind):
-    monkeypatch.setattr(trained_run, "open_run", lambda _: run)
+    monkeypatch.setattr(trained_run, "open_trained_run", lambda _: run)
     cloud = ball_run.write_material_cloud(tmp_path / "material.ply", material=factory.PLANT / 0.8)
     RenderCommand(tmp_path, tmp_path / "out", material=cloud, cubes=kind).main()
     measured, found = (
@@ -204,7 +204,7 @@ def test_views_of_the_material_show_the_cloud_that_tells_it(tmp_path, run, monke
 
 
 def test_an_orbit_of_another_size_without_cubes(tmp_path, run, monkeypatch):
-    monkeypatch.setattr(trained_run, "open_run", lambda _: run)
+    monkeypatch.setattr(trained_run, "open_trained_run", lambda _: run)
     RenderCommand(
         tmp_path,
         tmp_path / "out",
@@ -227,7 +227,7 @@ def test_an_orbit_of_another_size_without_cubes(tmp_path, run, monkeypatch):
 def test_a_run_that_fails_leaves_no_video(tmp_path, run, monkeypatch):
     from hsi_sc_nerf.rendering import views as render_views
 
-    monkeypatch.setattr(trained_run, "open_run", lambda _: run)
+    monkeypatch.setattr(trained_run, "open_trained_run", lambda _: run)
     render_view, seen = render_views.render_view, []
 
     def fail_at_the_second(model, camera):
