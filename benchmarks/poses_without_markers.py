@@ -42,7 +42,7 @@ from rich.progress import track
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, rotation_about_z
-from hsi_sc_nerf.poses.feature_poses import KnownCamera, poses_from_features
+from hsi_sc_nerf.poses.feature_poses import KnownCamera, poses_from_sfm
 from hsi_sc_nerf.poses.pose_methods import find_poses
 from hsi_sc_nerf.poses.report import check_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
@@ -165,8 +165,8 @@ class PosesWithoutMarkers:
         for name in self.objects:
             session = self._session(name, markers=False)
             for known, (info, camera) in what_is_known(session).items():
-                from_features = partial(poses_from_features, free=self._free_poses(name, session, camera))
-                self._write(name, known, _cells(session, info, camera, from_features))
+                from_sfm = partial(poses_from_sfm, free=self._free_poses(name, session, camera))
+                self._write(name, known, _cells(session, info, camera, from_sfm))
             session = self._session(name, markers=True)
             self._write(name, "markers", _cells(session, session.info, None, None))
 
@@ -222,15 +222,13 @@ def _cells(
     session: Session,
     info: SessionInfo,
     camera: KnownCamera | None,
-    from_features: Callable[..., TurntablePoses] | None,
+    from_sfm: Callable[..., TurntablePoses] | None,
 ) -> tuple[str, ...]:
     try:
-        if from_features is None:
+        if from_sfm is None:
             poses = find_poses(session.images, session.names, info, "markers")
         else:
-            poses = find_poses(
-                session.images, session.names, info, "colmap", camera=camera, from_features=from_features
-            )
+            poses = find_poses(session.images, session.names, info, "colmap", camera=camera, from_sfm=from_sfm)
     except InputError as error:
         return (*("",) * 9, f"refused: {error}")
     rotation_deg, position_mm = _errors(session, poses)

@@ -12,8 +12,8 @@ FACING = np.array([0.0, 0.0, 1.0])
 FRAMES, RADIUS_M, ELEVATION = 12, 0.04, 0.4
 
 
-def turning_ball(count: int = 300, places_m: np.ndarray | float = 0.0) -> TurningElements:
-    """Elements of a ball that sees no other, or of parts of such balls at some places, before a turning camera."""
+def turning_ball(count: int = 300, centres_m: np.ndarray | float = 0.0) -> TurningElements:
+    """Elements of a ball that sees no other, or of parts of such balls about some centres, before a turning camera."""
     normals = even_directions(count)
     cosines = np.maximum(normals @ DIRECTIONS.T, 0.0)
     transfer = Transfer(
@@ -26,7 +26,7 @@ def turning_ball(count: int = 300, places_m: np.ndarray | float = 0.0) -> Turnin
         rotations.append(np.stack([right, np.cross(back, right), back], axis=1))
     on_object = np.ones(count, bool)
     return TurningElements(
-        RADIUS_M * normals + places_m, normals, on_object, transfer, DIRECTIONS, np.array(rotations)
+        RADIUS_M * normals + centres_m, normals, on_object, transfer, DIRECTIONS, np.array(rotations)
     )
 
 

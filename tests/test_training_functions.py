@@ -77,8 +77,8 @@ def shading():
     """A shading that has learned something, of a soft ball."""
     torch.manual_seed(0)
     made = CameraShading((9, 9, 9), -torch.ones(3), 2.0 / 9.0, 3, torch.from_numpy(POSE), torch.zeros(3), -0.5)
-    places = torch.stack(torch.meshgrid(*[torch.arange(9) - 4.0] * 3, indexing="ij"), dim=-1)
-    made.refresh(torch.sigmoid(3.0 - places.norm(dim=-1)))
+    positions = torch.stack(torch.meshgrid(*[torch.arange(9) - 4.0] * 3, indexing="ij"), dim=-1)
+    made.refresh(torch.sigmoid(3.0 - positions.norm(dim=-1)))
     with torch.no_grad():
         for parameter in made.parameters():
             parameter.add_(0.3 * torch.randn(parameter.shape))
@@ -324,7 +324,7 @@ def test_normals_are_unit_vectors_or_nothing():
 
 
 @pytest.mark.parametrize("count", [1, 50])  # fewer than fit into a processor's vectors, and more
-def test_places_that_are_no_numbers_are_looked_up_somewhere(count):
+def test_positions_that_are_no_numbers_are_looked_up_somewhere(count):
     """The gradient of PyTorch's look-up would be written outside of its table there, and ends the process."""
     nowhere, made = torch.full((count, 3), torch.nan), shading().float()
     shaded = made(torch.ones(count, 3), nowhere, nowhere)

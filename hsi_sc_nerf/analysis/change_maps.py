@@ -139,8 +139,8 @@ def changes(
         each_day = zip(days, values, strict=True)
         first, last, *again = (np.where(day.surface.seen[:, None], each, np.nan) for day, each in each_day)
         of_patches, *of_repeat = (patches.means(each - first, one.areas_m2) for each in (last, *again))
-        slopes = np.linalg.norm(surface_gradients(patches.centres_m, patches.means(first, one.areas_m2)), axis=2)
-        off = np.nan_to_num(slopes) * misplaced_m * (name != SURFACE)
+        gradients = np.linalg.norm(surface_gradients(patches.centres_m, patches.means(first, one.areas_m2)), axis=2)
+        off = np.nan_to_num(gradients) * misplaced_m * (name != SURFACE)
         errors = of_repeat[0] if of_repeat else None
         at_rim = to_rim_m < RIM_M
         test = significance(of_patches, patches.centres_m, off, shared, conditions, errors, at_rim, quantities)

@@ -134,9 +134,9 @@ class _FixedSample:
         offset, normals = points - self.sample.points[at], self.sample.normals[at]
         off = np.einsum("ij,ij->i", offset, normals)
         paired = np.linalg.norm(offset - off[:, None] * normals, axis=1) < _OFF_EDGE * self.spacing_m
-        slopes = np.concatenate([normals[:, None], self.gradients[at]], axis=1)
+        gradients = np.concatenate([normals[:, None], self.gradients[at]], axis=1)
         values = np.concatenate([np.zeros((len(at), 1)), self.sample.features[at] - features], axis=1)
-        return values + np.einsum("nfj,nj->nf", slopes, offset), slopes, paired
+        return values + np.einsum("nfj,nj->nf", gradients, offset), gradients, paired
 
 
 def _starts(moving: SurfaceSample, reference: SurfaceSample) -> list[Similarity]:
@@ -174,14 +174,16 @@ def _system(
     """Normal matrix and each point's gradient of the loss by shift, turn and growth about the centre, and that."""
     points = transform(moving.points)
     centre = points.mean(axis=0)
-    residual, slopes, paired = target.residuals(points, moving.features)
+    residual, gradients, paired = target.residuals(points, moving.features)
     scale = robust_std(residual[paired] if paired.sum() > _PARAMETERS else residual, axis=0, least=_LEAST_SCATTER)
     weight = np.square(np.clip(1.0 - np.square(residual / (TUKEY * scale)), 0.0, None)) * paired[:, None]
     # Off the surface, spectra mean nothing.
     weight[:, 1:] *= weight[:, :1]
     weight /= np.square(scale)
     arm = (points - centre)[:, None, :]
-    jacobian = np.concatenate([slopes, np.cross(arm, slopes), (slopes * arm).sum(axis=2, keepdims=True)], axis=2)
+    jacobian = np.concatenate(
+        [gradients, np.cross(arm, gradients), (gradients * arm).sum(axis=2, keepdims=True)], axis=2
+    )
     matrix = np.einsum("nfi,nf,nfj->ij", jacobian, weight, jacobian)
     # What nothing determines does not move.
     matrix += np.diag(1e-9 * np.diag(matrix) + 1e-30)

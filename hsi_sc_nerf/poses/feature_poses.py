@@ -147,7 +147,7 @@ def poses_from_known_camera(
     )
 
 
-def poses_from_features(
+def poses_from_sfm(
     images: Images,
     names: Sequence[str],
     info: SessionInfo,

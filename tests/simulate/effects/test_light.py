@@ -206,8 +206,8 @@ def test_contact_shadow_of_a_drum_on_a_disc_as_by_brute_force():
     # The mean over azimuths is free of most of the chance in single points.
     azimuth = np.linspace(0.0, 2 * np.pi, 90, endpoint=False)
     around = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
-    places = (radius_m + distance_m)[:, None, None] * around
-    light = light_below(lighting, places.reshape(-1, 2))[(1,)].reshape(len(distance_m), -1).mean(axis=1)
+    positions = (radius_m + distance_m)[:, None, None] * around
+    light = light_below(lighting, positions.reshape(-1, 2))[(1,)].reshape(len(distance_m), -1).mean(axis=1)
 
     rays = cosine_directions(100_000, np.zeros(1))[0]
     slow = []
