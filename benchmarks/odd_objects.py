@@ -114,8 +114,8 @@ def _off_axis(scene: Scene, folder: Path) -> None:
 
 
 def _cut_at_the_top(fraction: float) -> Callable[[Scene, Path], None]:
-    """The object stands a little beside the axis, and its top leaves the image in the fraction of the frames in which it
-    is nearest to the camera."""
+    """The object stands a little beside the axis, and its top leaves the image in the fraction of the frames in which
+    it is nearest to the camera."""
 
     def make(scene: Scene, folder: Path) -> None:
         top_m = assemble.object_part(scene).mesh.vertices + np.array([SHIFT_M, 0.0, 0.0])

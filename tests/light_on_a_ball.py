@@ -13,7 +13,7 @@ FRAMES, RADIUS_M, ELEVATION = 12, 0.04, 0.4
 
 
 def turning_ball(count: int = 300, centres_m: np.ndarray | float = 0.0) -> TurningElements:
-    """Elements of a ball that sees no other, or of parts of such balls about some centres, before a turning camera."""
+    """Elements of a ball that sees no other, or parts of such balls about some centres, before a turning camera."""
     normals = even_directions(count)
     cosines = np.maximum(normals @ DIRECTIONS.T, 0.0)
     transfer = Transfer(

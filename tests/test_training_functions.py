@@ -324,7 +324,7 @@ def test_normals_are_unit_vectors_or_nothing():
 
 
 @pytest.mark.parametrize("count", [1, 50])  # fewer than fit into a processor's vectors, and more
-def test_positions_that_are_no_numbers_are_looked_up_somewhere(count):
+def test_places_that_are_no_numbers_are_looked_up_somewhere(count):
     """The gradient of PyTorch's look-up would be written outside of its table there, and ends the process."""
     nowhere, made = torch.full((count, 3), torch.nan), shading().float()
     shaded = made(torch.ones(count, 3), nowhere, nowhere)

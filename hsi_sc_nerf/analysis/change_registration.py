@@ -19,7 +19,7 @@ from hsi_sc_nerf.analysis.change_features import SurfaceSample, surface_gradient
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.registration import robust_radius
 from hsi_sc_nerf.geometry.camera import Similarity, rotation_about_z
-from hsi_sc_nerf.robust_scatter import robust_std
+from hsi_sc_nerf.robust_scatter import TUKEY, robust_std, tukey_weights
 
 SCALE_RANGE = (0.8, 1.25)
 """Growth beyond this is another object, or other units."""
@@ -35,7 +35,6 @@ FINE_ATTITUDES = 4
 """The best of the coarse ones, which are fitted again to the fine sample."""
 COARSE_ROUNDS, FINE_ROUNDS = 25, 30
 CONVERGED = 1e-5
-TUKEY = 4.685
 _OFF_EDGE = 1.5
 """Pairs further apart along the surface than this, in spacings, lie beyond the reference's edge."""
 _PARAMETERS = 7
@@ -176,7 +175,7 @@ def _system(
     centre = points.mean(axis=0)
     residual, gradients, paired = target.residuals(points, moving.features)
     scale = robust_std(residual[paired] if paired.sum() > _PARAMETERS else residual, axis=0, least=_LEAST_SCATTER)
-    weight = np.square(np.clip(1.0 - np.square(residual / (TUKEY * scale)), 0.0, None)) * paired[:, None]
+    weight = tukey_weights(residual, scale) * paired[:, None]
     # Off the surface, spectra mean nothing.
     weight[:, 1:] *= weight[:, :1]
     weight /= np.square(scale)

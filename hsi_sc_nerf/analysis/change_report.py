@@ -15,6 +15,7 @@ import numpy as np
 from hsi_sc_nerf.analysis.change import DayComparison
 from hsi_sc_nerf.analysis.change_days import Day
 from hsi_sc_nerf.analysis.change_maps import SPECTRUM, SURFACE
+from hsi_sc_nerf.analysis.report import CM2_PER_M2
 from hsi_sc_nerf.analysis.spectral_mesh import write_spectral_mesh
 from hsi_sc_nerf.files import atomic_write, nan_to_none, write_json
 from hsi_sc_nerf.terminal import markdown_table, markdown_text
@@ -27,7 +28,6 @@ COLUMNS = (
 WHOLE = "whole surface"
 CHANGED, UNDECIDED = "change", "undecided"
 """Kinds of rows: regions that count, and those up to the limit of blank."""
-_CM2_PER_M2 = 1e4
 _PAGE_REGIONS = 12
 
 
@@ -51,7 +51,7 @@ def change_rows(comparisons: Sequence[DayComparison]) -> list[dict[str, Any]]:
                 if name != SPECTRUM:
                     told["change_sd"] = float(quantity.test.noise[0])
                 told |= _areas(0.0, region.area_m2, region.centre_m) | {
-                    "area_change_sd_cm2": _CM2_PER_M2 * region.area_sd_m2
+                    "area_change_sd_cm2": CM2_PER_M2 * region.area_sd_m2
                 }
                 rows.append(head | {"kind": CHANGED if number < quantity.counted else UNDECIDED} | told)
         # Beside the first day, the regions themselves are what grew.
@@ -68,7 +68,7 @@ def change_rows(comparisons: Sequence[DayComparison]) -> list[dict[str, Any]]:
 
 
 def _areas(before_m2: float, after_m2: float, centre_m: Sequence[float] = ()) -> dict[str, float]:
-    before, after = _CM2_PER_M2 * before_m2, _CM2_PER_M2 * after_m2
+    before, after = CM2_PER_M2 * before_m2, CM2_PER_M2 * after_m2
     told = {"area_before_cm2": before, "area_after_cm2": after, "area_change_cm2": after - before}
     return told | dict(zip(("x_mm", "y_mm", "z_mm"), (1e3 * x for x in centre_m), strict=False))
 
@@ -175,7 +175,7 @@ def _undecided(comparisons: Sequence[DayComparison], rows: Sequence[Mapping[str,
     if limit_m2 == 0.0:
         return []
     told = (
-        f"Two captures of one day show regions of up to {_CM2_PER_M2 * limit_m2:.2g} cm² that are no change (limit "
+        f"Two captures of one day show regions of up to {CM2_PER_M2 * limit_m2:.2g} cm² that are no change (limit "
         "of blank). "
     )
     if not rows:

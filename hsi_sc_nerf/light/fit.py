@@ -19,7 +19,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.geometry.camera import unit_vectors
-from hsi_sc_nerf.light.shared_errors import CORRELATED, SMALLEST_SCATTER, SharedErrors, scatter_beyond, tukey_weights
+from hsi_sc_nerf.light.shared_errors import CORRELATED, SMALLEST_SCATTER, SharedErrors, scatter_beyond
 from hsi_sc_nerf.light.stationary_light import (
     DEGREE_OF_TERM,
     TERMS,
@@ -30,7 +30,7 @@ from hsi_sc_nerf.light.stationary_light import (
     unit_irradiance,
 )
 from hsi_sc_nerf.light.views import ElementViews, LampUnits, TurningElements
-from hsi_sc_nerf.robust_scatter import robust_std
+from hsi_sc_nerf.robust_scatter import robust_std, tukey_weights
 
 MOST_LAMPS = 4
 CANDIDATES = 200
@@ -273,7 +273,8 @@ class _LightFitting:
         self.scatter = float(robust_std(residual[used], least=SMALLEST_SCATTER))
         beyond = scatter_beyond(residual[used], self._own_std[used])
         std = np.hypot(beyond, self._own_std)
-        self.weights = np.where(used, tukey_weights(residual / std), 1.0)
+        # Never 0, so that no element is left without a measurement.
+        self.weights = np.where(used, np.maximum(tukey_weights(residual / std), 1e-6), 1.0)
         self._precision = self.weights * used / std**2
 
     def _prior(self) -> tuple[np.ndarray, np.ndarray]:
