@@ -11,8 +11,7 @@ from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.analysis.change_days import Day
 from hsi_sc_nerf.analysis.change_features import COMPONENTS, surface_gradients, unit_spectra
-from hsi_sc_nerf.analysis.change_limit import limit_of_blank_m2
-from hsi_sc_nerf.analysis.change_regions import OUTSIDE, ChangedRegion, changed_regions
+from hsi_sc_nerf.analysis.change_regions import OUTSIDE, ChangedRegion, changed_regions, limit_of_blank_m2
 from hsi_sc_nerf.analysis.change_significance import (
     FALSE_DISCOVERIES,
     Significance,
@@ -47,7 +46,7 @@ class Quantity:
         test: of the patches and of the whole surface.
         region: number of each vertex's region, -1 outside.
         regions: areas that changed beyond noise, and otherwise than the whole surface, the largest first.
-        limit_m2: regions up to this area are undecided (`hsi_sc_nerf.analysis.change_limit`); 0 with a repeat.
+        limit_m2: regions up to this area are undecided (`limit_of_blank_m2`); 0 with a repeat.
     """
 
     name: str

@@ -27,12 +27,6 @@ Tells = Callable[[Mapping[str, Any]], Iterator[tuple[Column, Value]]]
 """What is to be read from the content of a file."""
 
 
-class _Trouble(NamedTuple):
-    status: str
-    step: str
-    sentence: str
-
-
 @dataclass(frozen=True)
 class ObjectRow:
     """What is known of one object.
@@ -198,3 +192,9 @@ def _number(value: Any, factor: float = 1.0) -> float | None:
         raise TypeError(f"{shown(value)} is no number")
     scaled = factor * float(value)
     return scaled if math.isfinite(scaled) else None
+
+
+class _Trouble(NamedTuple):
+    status: str
+    step: str
+    sentence: str

@@ -89,13 +89,6 @@ class PackedFrame:
         return _picture(self.image_path, 3)
 
 
-def _picture(path: Path, channels: Literal[1, 3]) -> UInt8[np.ndarray, "lines samples *channels"]:
-    image = read_picture(path, channels)
-    if image is None:
-        raise InputError(f"{path}: is not a readable picture; {_AGAIN}.")
-    return image
-
-
 @dataclass(frozen=True, eq=False)
 class PackedDataset:
     """The content of ``transforms.json``.
@@ -348,3 +341,10 @@ def _parse_frame(root: Path, frame: dict[str, Any]) -> PackedFrame:
         camera_to_world=pose,
         **{name: root / file for name, file in files.items()},
     )
+
+
+def _picture(path: Path, channels: Literal[1, 3]) -> UInt8[np.ndarray, "lines samples *channels"]:
+    image = read_picture(path, channels)
+    if image is None:
+        raise InputError(f"{path}: is not a readable picture; {_AGAIN}.")
+    return image

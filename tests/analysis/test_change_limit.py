@@ -11,8 +11,8 @@ from results_table import RESULTS, read_results
 
 from hsi_sc_nerf.analysis.change import compare_days
 from hsi_sc_nerf.analysis.change_days import Day
-from hsi_sc_nerf.analysis.change_limit import LIMIT_M2, LIMIT_PART, limit_of_blank_m2
 from hsi_sc_nerf.analysis.change_pictures import draw_change, draw_class_change
+from hsi_sc_nerf.analysis.change_regions import LIMIT_M2, LIMIT_PART, limit_of_blank_m2
 from hsi_sc_nerf.analysis.change_registration import Attitude
 from hsi_sc_nerf.analysis.change_report import change_rows, write_change_ply, write_change_tables
 from hsi_sc_nerf.analysis.library import SpectralLibrary
