@@ -6,7 +6,7 @@ import math
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -17,6 +17,9 @@ from hsi_sc_nerf.export.options import CloudOptions
 from hsi_sc_nerf.files import require_writable
 from hsi_sc_nerf.packed.of_run import require_dataset_of_run
 from hsi_sc_nerf.settings_file import between, check_options
+
+if TYPE_CHECKING:
+    from hsi_sc_nerf.models.trained_run import TrainedRun
 
 _METRES = {"m": 1.0, "mm": 1e-3}
 
@@ -78,8 +81,11 @@ class SampleCommand:
     """The run's cloud by `hsi-sc-nerf material`: points also get the material's reflectance (material_397.32nm, ...),
     irradiance and irradiance_std. Points further than 3 mm from the cloud have NaN there."""
 
-    def main(self) -> None:
+    def main(self, run: TrainedRun | None = None) -> None:
         """Run the command.
+
+        Args:
+            run: that of ``load_config``, where it is open already.
 
         Raises:
             InputError: the points or the run cannot be used, no point lies on the object, or the result cannot be
@@ -96,7 +102,8 @@ class SampleCommand:
         require_writable(output.parent)
         given = read_points(self.points)
         normals = given.normals()
-        run = open_trained_run(self.load_config)
+        if run is None:
+            run = open_trained_run(self.load_config)
         wavelengths_nm = run.dataset.wavelengths_nm
         material = None if self.material is None else read_material(self.material, wavelengths_nm)
         points_m = given.positions * _METRES[self.unit]
@@ -153,8 +160,11 @@ class RenderCommand:
     """The run's cloud by `hsi-sc-nerf material`: NAME_material is a cube of the material's reflectance beside each
     cube. It has no data where a pixel shows nothing within 3 mm of the cloud."""
 
-    def main(self) -> None:
+    def main(self, run: TrainedRun | None = None) -> None:
         """Run the command.
+
+        Args:
+            run: that of ``load_config``, where it is open already.
 
         Raises:
             InputError: the run, a camera path or a name cannot be used, or a result cannot be written.
@@ -180,7 +190,8 @@ class RenderCommand:
         from hsi_sc_nerf.spectra import to_8_bit
         from hsi_sc_nerf.terminal import progress_bar
 
-        run = open_trained_run(self.load_config)
+        if run is None:
+            run = open_trained_run(self.load_config)
         material = None if self.material is None else read_material(self.material, run.dataset.wavelengths_nm)
         found = [find_false_colour(name, run.dataset.wavelengths_nm) for name in self.video]
         shown = list({item.name: item for item in found}.values())  # a name may be given twice
