@@ -80,6 +80,12 @@ def compare_days(
 
     Raises:
         InputError: too little is seen on both days, or the library or a wavelength does not fit the bands.
+
+    Example:
+        >>> days = days_on_one_mesh(clouds, ("monday", "friday"), MeshConfig(), 65.0)
+        >>> indices = find_indices(["NDVI"], clouds[0].wavelengths_nm)
+        >>> for one in compare_days(days, (670.0,), indices, 0.01):
+        ...     print(one.after.name, [region.area_m2 for region in one.quantities["NDVI"].regions])
     """
     first, earlier = days[0], None
     mesh, areas_m2 = first.surface.mesh, first.surface.areas_m2

@@ -79,11 +79,11 @@ class ReportSources:
 def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
     """Write the report of the run in ``folder``, completely or not at all.
 
-    Example:
-        >>> write_report(Path("outputs/pear/hsi-sc-nerf/run"), Path("report.html"), ReportSources(views=4))
-
     Raises:
         InputError: the run, its dataset or a file given cannot be used, or the report cannot be written.
+
+    Example:
+        >>> write_report(Path("outputs/pear/hsi-sc-nerf/run"), Path("report.html"), ReportSources(views=4))
     """
     if (sources.views is not None and sources.views < 1) or sources.points < 1:
         raise InputError("--views and --points must be at least 1.")
