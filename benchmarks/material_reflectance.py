@@ -33,7 +33,13 @@ from true_object import TrueObject, relative_rms
 
 from hsi_sc_nerf.export.cloud import INCIDENCE, read_spectral_ply
 from hsi_sc_nerf.geometry.mesh import Mesh
-from hsi_sc_nerf.light.elements import LARGEST_INCIDENCE_DEG, Elements, observe, spread_elements, support_mesh
+from hsi_sc_nerf.light.elements import (
+    LARGEST_INCIDENCE_DEG,
+    Elements,
+    observe_elements,
+    spread_elements,
+    support_mesh,
+)
 from hsi_sc_nerf.light.fit import WHITE_STD
 from hsi_sc_nerf.light.material import light_on_object, turning_elements
 from hsi_sc_nerf.light.of_run import ShadingEvidence, light_of_run, shading_evidence
@@ -167,7 +173,7 @@ def judge_true_mesh(truth: Truth, container_m: tuple[float, float], *, even: boo
         return truth.reflectance(capture) if of_material else truth.light(capture).radiance()
 
     def observed(some: Elements, *, of_material: bool) -> ElementViews:
-        return observe(
+        return observe_elements(
             some,
             poses,
             truth.intrinsics,

@@ -89,7 +89,7 @@ def write_measurement(folder: Path | str, measured: Measurement, name: str) -> d
     write_library(folder / "regions.sli", measured.region_spectra())
     content = replace(measured, settings={"cloud": name, **measured.settings}).content()
     write_json(folder / "traits.json", content)
-    report.write_page(folder / "traits.md", name, content, drawn)
+    report.write_traits_page(folder / "traits.md", name, content, drawn)
     delete_earlier(folder, keep=(*_TABLES, *drawn.values()))
     return content
 

@@ -288,7 +288,7 @@ def _class_tables(classes: Mapping[str, Any], seen_m2: float) -> list[TraitTable
     ]
 
 
-def write_page(path: Path, title: str, content: Mapping[str, Any], pictures: Mapping[str, str]) -> None:
+def write_traits_page(path: Path, title: str, content: Mapping[str, Any], pictures: Mapping[str, str]) -> None:
     """Write ``traits.md``: the tables of ``content``, and pictures (file names by caption)."""
     parts = [f"# Traits of {markdown_text(title)}"]
     for table in trait_tables(content):

@@ -173,7 +173,7 @@ def support_mesh(container_m: tuple[float, float] | None, disc_radius_m: float) 
     return Mesh(mesh.vertices, mesh.triangles[mesh.triangle_areas_m2() > 0.0])
 
 
-def observe(
+def observe_elements(
     elements: Elements,
     camera_to_world: Float[np.ndarray, "frames 4 4"],
     intrinsics: PinholeIntrinsics,

@@ -24,8 +24,8 @@ from hsi_sc_nerf.light.stationary_light import (
     DEGREE_OF_TERM,
     TERMS,
     StationaryLight,
+    even_chamber,
     even_directions,
-    even_light,
     tangents,
     unit_irradiance,
 )
@@ -134,7 +134,7 @@ class _LightFitting:
         occluded = 1.0 - elements.transfer.sky[views.element]
         self._own_std = np.hypot(views.own_std, OCCLUSION_ERROR * occluded)
         self._precision = np.zeros(count[0])
-        self.light = even_light(views.reflectance.shape[1])
+        self.light = even_chamber(views.reflectance.shape[1])
         self.weights, self.scatter = np.ones(count[0]), 0.0
         self.unevenness = UNEVENNESS_AT_FIRST
         self.bounced = np.zeros((count[0], views.reflectance.shape[1]), np.float32)

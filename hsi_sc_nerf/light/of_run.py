@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import CERTAIN
 from hsi_sc_nerf.geometry.mesh import Mesh
-from hsi_sc_nerf.light.elements import observe, spread_elements, support_mesh
+from hsi_sc_nerf.light.elements import observe_elements, spread_elements, support_mesh
 from hsi_sc_nerf.light.fit import LightFit
 from hsi_sc_nerf.light.material import ObjectLight, light_on_object, turning_elements
 from hsi_sc_nerf.light.views import ElementViews, TurningElements
@@ -116,7 +116,7 @@ def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"]) -> RunLi
         )
         return np.where(valid, reflectance, np.nan)
 
-    views = observe(elements, poses, renders.intrinsics, renders.distortion, sampler.masks, pixels, LIFT_M)
+    views = observe_elements(elements, poses, renders.intrinsics, renders.distortion, sampler.masks, pixels, LIFT_M)
     if views.shows_light.sum() < LEAST_VIEWS:
         raise InputError(
             "too few pixels of the object fit its surface; look at masks and poses in the dataset's report."

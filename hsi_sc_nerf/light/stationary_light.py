@@ -52,7 +52,7 @@ class StationaryLight:
         return float(of_chamber @ self.chamber), float(of_lamps @ self.lamps)
 
 
-def even_light(bands: int) -> StationaryLight:
+def even_chamber(bands: int) -> StationaryLight:
     """The light of an even chamber without lamps."""
     return StationaryLight(np.eye(TERMS)[0], np.zeros(0), np.zeros((0, 3)), 0.0, np.ones(bands), np.ones(bands))
 

@@ -6,7 +6,14 @@ import trimesh
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.geometry.mesh import Mesh
-from hsi_sc_nerf.light.elements import MISPLACED_PX, Elements, observe, shown_points, spread_elements, support_mesh
+from hsi_sc_nerf.light.elements import (
+    MISPLACED_PX,
+    Elements,
+    observe_elements,
+    shown_points,
+    spread_elements,
+    support_mesh,
+)
 from hsi_sc_nerf.light.stationary_light import even_directions
 from hsi_sc_nerf.light.views import Transfer, transfer
 
@@ -109,7 +116,7 @@ def test_measurements_are_uncertain_where_brightness_changes_from_pixel_to_pixel
     pose = np.eye(4)
     pose[2, 3] = DISTANCE_M
     focal = DISTANCE_M / PIXEL_M
-    views = observe(
+    views = observe_elements(
         elements,
         pose[None],
         PinholeIntrinsics(SIZE, SIZE, focal, focal, SIZE / 2, SIZE / 2),
