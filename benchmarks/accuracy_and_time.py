@@ -48,7 +48,7 @@ from hsi_sc_nerf.export.options import CloudOptions
 from hsi_sc_nerf.export.spectral_export import export_cloud
 from hsi_sc_nerf.files import read_json, write_json
 from hsi_sc_nerf.models.presets import ITERATIONS, PRESETS
-from hsi_sc_nerf.models.trained_run import open_run
+from hsi_sc_nerf.models.trained_run import open_trained_run
 from hsi_sc_nerf.simulate.effects.detector import ReadNoise
 from hsi_sc_nerf.simulate.scene import Fruit, load_scene
 from hsi_sc_nerf.simulate.scores import true_reference
@@ -264,7 +264,7 @@ def surface_figures(config: Path, session: Path) -> dict[str, float]:
     truth = load_truth(session)
     with TemporaryDirectory() as temporary:
         cloud = read_spectral_ply(
-            export_cloud(open_run(config), Path(temporary), CloudOptions(num_points=CLOUD_POINTS))
+            export_cloud(open_trained_run(config), Path(temporary), CloudOptions(num_points=CLOUD_POINTS))
         )
     reference = true_reference(session, CompareConfig(whole_reference=False))
     assert reference.seen is not None

@@ -27,7 +27,7 @@ from rich.progress import track
 from scipy.spatial import cKDTree
 from true_object import TrueObject
 
-from hsi_sc_nerf.analysis.change import Comparison, compare_days
+from hsi_sc_nerf.analysis.change import DayComparison, compare_days
 from hsi_sc_nerf.analysis.change_days import Day, days_on_one_mesh
 from hsi_sc_nerf.analysis.change_maps import BRIGHTNESS
 from hsi_sc_nerf.benchmark.steps import run_step, typed_command
@@ -37,7 +37,7 @@ from hsi_sc_nerf.indices.catalogue import find_indices
 from hsi_sc_nerf.simulate.render import Part
 from hsi_sc_nerf.simulate.scene import OwnMesh, load_scene, override
 from hsi_sc_nerf.simulate.session import simulate_session
-from hsi_sc_nerf.simulate.truth import write_mesh
+from hsi_sc_nerf.simulate.truth import write_true_mesh
 
 BANDS, FRAMES, SIZE_PX, POINTS = 25, 36, 128, 200_000
 EVERY = 4
@@ -110,7 +110,7 @@ class ChangeOfRuns:
     def _fruit(self, seed: int, day: SetDown) -> TrueObject:
         return fruit_of(day, NM, self.kind, seed, self.height_m)
 
-    def _row(self, fruit: int, one: Comparison, repeat: Day | None, name: str = "") -> list[str]:
+    def _row(self, fruit: int, one: DayComparison, repeat: Day | None, name: str = "") -> list[str]:
         day, attitude, brightness = DAYS[one.after.name], one.after.attitude, one.quantities[BRIGHTNESS]
         assert attitude is not None
         grew = by_brightness = ""
@@ -150,7 +150,7 @@ class ChangeOfRuns:
             folder.mkdir(parents=True, exist_ok=True)
             fruit = self._fruit(seed, day)
             placed = Mesh(set_down(day, fruit.mesh.vertices)(fruit.mesh.vertices), fruit.mesh.triangles)
-            write_mesh(folder / "fruit.ply", Part(placed, fruit.materials, fruit.weights))
+            write_true_mesh(folder / "fruit.ply", Part(placed, fruit.materials, fruit.weights))
             own = OwnMesh("mesh", folder / "fruit.ply", fruit.materials)
             scene = replace(load_scene("apple"), object=own, materials=dried_materials(day, self.kind))
             scene = override(scene, frames=FRAMES, size_px=SIZE_PX, bands=BANDS, seed=10 * seed + at, effects=EFFECTS)
@@ -185,7 +185,7 @@ def on_the_table(fruit: TrueObject) -> Float[np.ndarray, "v 3"]:
     return placed + np.array([-centre[0], -centre[1], STAND_M - placed[:, 2].min()])
 
 
-def _undecided_cm2(one: Comparison, far: Bool[np.ndarray, "v"]) -> dict[str, float]:
+def _undecided_cm2(one: DayComparison, far: Bool[np.ndarray, "v"]) -> dict[str, float]:
     """Area of the largest undecided region of each quantity that lies away from what changed; 0 for none."""
     areas_m2, largest = one.after.surface.areas_m2, {}
     for name, quantity in one.quantities.items():

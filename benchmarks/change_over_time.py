@@ -21,7 +21,7 @@ from rich.progress import track
 from scipy.spatial import cKDTree
 from true_object import TrueObject
 
-from hsi_sc_nerf.analysis.change import Comparison, compare_days
+from hsi_sc_nerf.analysis.change import DayComparison, compare_days
 from hsi_sc_nerf.analysis.change_days import days_on_one_mesh
 from hsi_sc_nerf.analysis.change_features import surface_samples
 from hsi_sc_nerf.analysis.change_maps import BRIGHTNESS
@@ -134,7 +134,7 @@ def _draw(path: Path, points: int) -> None:
     draw_change(path, first, found, found.quantities[BRIGHTNESS], SideViews(first.surface.mesh))
 
 
-def _false_cm2(first: TrueObject, now: TrueObject, day: SetDown, one: Comparison) -> float:
+def _false_cm2(first: TrueObject, now: TrueObject, day: SetDown, one: DayComparison) -> float:
     """Area that any quantity calls changed, away from what did: bruise, and the place of a lost stem."""
     bruise, stem = first.materials.index("bruise"), first.materials.index("stem")
     differs = np.abs(now.weights[:, bruise] - first.weights[:, bruise]) > 0.02
@@ -148,7 +148,7 @@ def _false_cm2(first: TrueObject, now: TrueObject, day: SetDown, one: Comparison
     return float(1e4 * surface.areas_m2[changed].sum())
 
 
-def _row(kind: str, name: str, day: SetDown, first: TrueObject, now: TrueObject, one: Comparison) -> list[str]:
+def _row(kind: str, name: str, day: SetDown, first: TrueObject, now: TrueObject, one: DayComparison) -> list[str]:
     attitude, brightness = one.after.attitude, one.quantities[BRIGHTNESS]
     assert attitude is not None
     grew, by_brightness, by_class = [""] * 3

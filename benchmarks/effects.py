@@ -30,7 +30,7 @@ from hsi_sc_nerf.benchmark.configurations import own_configuration
 from hsi_sc_nerf.benchmark.run import HeldOutViews
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_metrics
 from hsi_sc_nerf.files import write_json
-from hsi_sc_nerf.findings import Effect
+from hsi_sc_nerf.findings import EffectEvidence
 from hsi_sc_nerf.geometry.camera import rotation_about_z
 from hsi_sc_nerf.models.chosen_effects import MODEL_EFFECTS, chosen_effects, effects_setting
 from hsi_sc_nerf.packed.dataset import open_packed
@@ -228,7 +228,7 @@ def held_out_views(
         yield rendered, expected, batch["mask"][..., 0].bool(), pipeline.model.rgb_bands
 
 
-def decision_rows(case: Case, effects: Sequence[Effect]) -> list[list[str]]:
+def decision_rows(case: Case, effects: Sequence[EffectEvidence]) -> list[list[str]]:
     """A row for each effect of a session."""
     rows = []
     for effect in effects:

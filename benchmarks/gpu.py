@@ -60,7 +60,7 @@ PLUGIN = {
 
 
 @dataclass(frozen=True)
-class Run:
+class TrainingRun:
     """One training: ``NAME:STEP:SECONDS``, or ``NAME:STEP:ITERATIONSi``."""
 
     configuration: str
@@ -69,7 +69,7 @@ class Run:
     iterations: int | None
 
     @classmethod
-    def parse(cls, text: str) -> Run:
+    def parse(cls, text: str) -> TrainingRun:
         """From the command line."""
         name, step, length = text.split(":")
         if length.endswith("i"):
@@ -250,12 +250,12 @@ class GpuBenchmark:
     def _train(self) -> None:
         for number, text in enumerate(self.runs):
             try:
-                self._train_one(number, Run.parse(text))
+                self._train_one(number, TrainingRun.parse(text))
             except Exception as error:
                 self._say(f"{text} FAILED: {error!r}")
                 self._row(part="train", note=f"{text} failed: {error}"[:300])
 
-    def _train_one(self, number: int, run: Run) -> None:
+    def _train_one(self, number: int, run: TrainingRun) -> None:
         """One training in a process of its own, as `hsi-sc-nerf benchmark` does it."""
         import shlex
 

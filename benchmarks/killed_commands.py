@@ -62,7 +62,7 @@ _LOOK_EVERY_S = 0.01
 
 
 @dataclass(frozen=True)
-class Command:
+class KilledCommand:
     """A command that writes to the folder ``out`` of the current one."""
 
     name: str
@@ -75,14 +75,14 @@ class Command:
         return (*self.words, *(("--load-dir", str(checkpoints)) if saved else ()))
 
 
-def commands(inputs: Path) -> list[Command]:
+def commands(inputs: Path) -> list[KilledCommand]:
     """The commands; each works on what the references of those before it left in ``inputs``."""
     data, run, cloud = inputs / "process" / "out", inputs / "ns-train" / "out" / TRAINED, "point_cloud.ply"
     training = f"ns-train hsi-sc-nerf --data {data} --output-dir out --experiment-name e --timestamp run"
     training += f" --vis tensorboard --max-num-iterations {STEPS} --steps-per-save {STEPS // 5}"
     training += f" --pipeline.datamanager.train-num-rays-per-batch {RAYS} --steps-per-eval-batch {STEPS // 3}"
     return [
-        Command(line.split()[0] if line.startswith("ns") else line.split()[1], tuple(line.split()))
+        KilledCommand(line.split()[0] if line.startswith("ns") else line.split()[1], tuple(line.split()))
         for line in (
             f"hsi-sc-nerf process {inputs / 'session'} --output-dir out",
             training,
@@ -149,7 +149,7 @@ def processor_s(process: subprocess.Popen[bytes]) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def undisturbed(command: Command, folder: Path) -> tuple[float, float, float]:
+def undisturbed(command: KilledCommand, folder: Path) -> tuple[float, float, float]:
     """Run a command; its processor time until its first file, until all is written, and until its end.
 
     Raises:
@@ -168,7 +168,7 @@ def undisturbed(command: Command, folder: Path) -> tuple[float, float, float]:
     return first_file_s, written_s, after.ru_utime + after.ru_stime - children.ru_utime - children.ru_stime
 
 
-def killed(command: Command, folder: Path, reference: Path, expected: list[Moment]) -> Counter[str]:
+def killed(command: KilledCommand, folder: Path, reference: Path, expected: list[Moment]) -> Counter[str]:
     """Kill a command at every moment, let it run to its end after some, and count what is wrong."""
     found: Counter[str] = Counter()
     shutil.rmtree(folder, ignore_errors=True)
@@ -213,7 +213,7 @@ def in_pieces(
     return counts
 
 
-def pressed(command: Command, folder: Path, reference: Path, expected: list[Moment]) -> Counter[str]:
+def pressed(command: KilledCommand, folder: Path, reference: Path, expected: list[Moment]) -> Counter[str]:
     """Press Ctrl-C once at every moment, each time in a new folder."""
     counts: Counter[str] = Counter()
     for moment in expected:
@@ -226,7 +226,7 @@ def pressed(command: Command, folder: Path, reference: Path, expected: list[Mome
     return counts
 
 
-def _stopped(command: Command, folder: Path, reference: Path, moment: Moment) -> Counter[str] | None:
+def _stopped(command: KilledCommand, folder: Path, reference: Path, moment: Moment) -> Counter[str] | None:
     """Press Ctrl-C once, and count how the command ends and what it leaves; None where it had ended."""
     found: Counter[str] = Counter()
     process = start(command.words, folder)

@@ -33,12 +33,18 @@ from true_object import TrueObject, relative_rms
 
 from hsi_sc_nerf.export.cloud import INCIDENCE, read_spectral_ply
 from hsi_sc_nerf.geometry.mesh import Mesh
-from hsi_sc_nerf.light.elements import LARGEST_INCIDENCE_DEG, Elements, observe, spread_elements, support_mesh
+from hsi_sc_nerf.light.elements import (
+    LARGEST_INCIDENCE_DEG,
+    Elements,
+    observe_elements,
+    spread_elements,
+    support_mesh,
+)
 from hsi_sc_nerf.light.fit import WHITE_STD
 from hsi_sc_nerf.light.material import light_on_object, turning_elements
 from hsi_sc_nerf.light.of_run import ShadingEvidence, light_of_run, shading_evidence
-from hsi_sc_nerf.light.views import Views
-from hsi_sc_nerf.models.trained_run import open_run
+from hsi_sc_nerf.light.views import ElementViews
+from hsi_sc_nerf.models.trained_run import open_trained_run
 from hsi_sc_nerf.processing.visual_hull import DISC_OVER_MARKERS
 from hsi_sc_nerf.simulate.effects.light import Lamp
 from hsi_sc_nerf.simulate.truth import Truth, load_truth
@@ -166,8 +172,8 @@ def judge_true_mesh(truth: Truth, container_m: tuple[float, float], *, even: boo
         capture = truth.captures[frame]
         return truth.reflectance(capture) if of_material else truth.light(capture).radiance()
 
-    def observed(some: Elements, *, of_material: bool) -> Views:
-        return observe(
+    def observed(some: Elements, *, of_material: bool) -> ElementViews:
+        return observe_elements(
             some,
             poses,
             truth.intrinsics,
@@ -200,7 +206,7 @@ def judge_true_mesh(truth: Truth, container_m: tuple[float, float], *, even: boo
 
 def judge_run(truth: Truth, config: Path, cloud_path: Path) -> Judged:
     """The light on a run's surface, and the spectra of its cloud."""
-    run, cloud = open_run(config), read_spectral_ply(cloud_path)
+    run, cloud = open_trained_run(config), read_spectral_ply(cloud_path)
     started = time.process_time()
     found = light_of_run(run, facing_of(truth))
     seconds, surface = time.process_time() - started, TrueObject.of(truth)

@@ -113,9 +113,9 @@ def _off_axis(scene: Scene, folder: Path) -> None:
     _moved(scene, folder, SHIFT_M)
 
 
-def _cut_at_the_top(share: float) -> Callable[[Scene, Path], None]:
-    """The object stands a little beside the axis, and its top leaves the image in the share of the frames in which it
-    is nearest to the camera."""
+def _cut_at_the_top(fraction: float) -> Callable[[Scene, Path], None]:
+    """The object stands a little beside the axis, and its top leaves the image in the fraction of the frames in which
+    it is nearest to the camera."""
 
     def make(scene: Scene, folder: Path) -> None:
         top_m = assemble.object_part(scene).mesh.vertices + np.array([SHIFT_M, 0.0, 0.0])
@@ -123,7 +123,7 @@ def _cut_at_the_top(share: float) -> Callable[[Scene, Path], None]:
         for _ in range(5):  # the lines change nearly in proportion to the aim
             poses = assemble.frame_plan(scene).camera_to_world
             lines = [project(top_m, pose, lens)[0][:, 1].min() for pose in poses]
-            lower_m = float(np.quantile(lines, share)) * scene.camera.distance_m / lens.fl_y
+            lower_m = float(np.quantile(lines, fraction)) * scene.camera.distance_m / lens.fl_y
             camera = replace(scene.camera, aim_height_m=scene.camera.aim_height_m - lower_m)
             scene = replace(scene, camera=camera)
         _moved(scene, folder, SHIFT_M)

@@ -36,7 +36,7 @@ RAYS = 256
 
 
 @dataclass
-class Scene:
+class OddScene:
     """A dataset in memory; NaN is a flagged value."""
 
     reflectance: np.ndarray
@@ -52,7 +52,7 @@ class Case:
     """A situation: what it changes in the scene, in the settings, and in the trainer that is set up by them."""
 
     name: str
-    data: Callable[[Scene], None] = lambda scene: None
+    data: Callable[[OddScene], None] = lambda scene: None
     settings: Callable[[Any], None] = lambda config: None
     trainer: Callable[[Any], None] = lambda trainer: None
 
@@ -78,12 +78,12 @@ class Ended:
         return (self.message != "" and "\n" not in self.message) or self.after < self.before
 
 
-def simulated(folder: Path) -> Scene:
+def simulated(folder: Path) -> OddScene:
     """The pear that all cases are made from."""
     scene = override(load_scene("pear"), frames=FRAMES, size_px=SIZE_PX, bands=BANDS, effects=[])
     truth = load_truth(simulate_session(scene, folder / "session", progress=False))
     vertices = truth.mesh().vertices
-    return Scene(
+    return OddScene(
         np.stack([truth.reflectance(name) for name in truth.captures]),
         np.stack([truth.object_coverage(name) > 0.5 for name in truth.captures]),
         np.array(truth.camera_to_world),
@@ -93,7 +93,7 @@ def simulated(folder: Path) -> Scene:
     )
 
 
-def _write(scene: Scene, root: Path) -> None:
+def _write(scene: OddScene, root: Path) -> None:
     frames = []
     for i, (cube, mask, pose) in enumerate(zip(scene.reflectance, scene.masks, scene.poses, strict=True)):
         paths = [root / kind / f"f{i}.png" for kind in ("images", "masks", "flags")]
@@ -117,7 +117,7 @@ def _write(scene: Scene, root: Path) -> None:
     )
 
 
-def train(case: Case, scene: Scene, folder: Path, steps: int) -> Ended:
+def train(case: Case, scene: OddScene, folder: Path, steps: int) -> Ended:
     """Train a case."""
     scene = dataclasses.replace(scene, reflectance=scene.reflectance.copy(), masks=scene.masks.copy())
     case.data(scene)
@@ -171,16 +171,16 @@ def _error(trainer: Any) -> float:
     return float((squares if valid is None else squares[valid.to(found.device)]).mean().sqrt())
 
 
-def _keep_frames(*kept: int) -> Callable[[Scene], None]:
-    def change(scene: Scene) -> None:
+def _keep_frames(*kept: int) -> Callable[[OddScene], None]:
+    def change(scene: OddScene) -> None:
         rows = list(kept)
         scene.reflectance, scene.masks, scene.poses = scene.reflectance[rows], scene.masks[rows], scene.poses[rows]
 
     return change
 
 
-def _bands(count: int) -> Callable[[Scene], None]:
-    def change(scene: Scene) -> None:
+def _bands(count: int) -> Callable[[OddScene], None]:
+    def change(scene: OddScene) -> None:
         nm = np.linspace(400.0, 1000.0, count) if count > 1 else np.array([700.0])
         at = np.clip(np.searchsorted(scene.wavelengths_nm, nm), 0, len(scene.wavelengths_nm) - 1)
         scene.reflectance, scene.wavelengths_nm = scene.reflectance[..., at], nm
@@ -188,7 +188,7 @@ def _bands(count: int) -> Callable[[Scene], None]:
     return change
 
 
-def _values(change: Callable[[np.ndarray, np.ndarray], Any]) -> Callable[[Scene], Any]:
+def _values(change: Callable[[np.ndarray, np.ndarray], Any]) -> Callable[[OddScene], Any]:
     return lambda scene: change(scene.reflectance, scene.masks)
 
 

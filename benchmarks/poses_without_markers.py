@@ -42,7 +42,7 @@ from rich.progress import track
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, rotation_about_z
-from hsi_sc_nerf.poses.feature_poses import KnownCamera, poses_from_features
+from hsi_sc_nerf.poses.feature_poses import KnownCamera, poses_from_sfm
 from hsi_sc_nerf.poses.pose_methods import find_poses
 from hsi_sc_nerf.poses.report import check_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
@@ -83,7 +83,7 @@ PATH_TRACED = {"quince, path-traced": 17.0, "quince, path-traced, wider lens": 2
 
 
 @dataclass(frozen=True, eq=False)
-class Session:
+class KnownSession:
     """Pictures of a session, its true camera and poses, and all that a laboratory could note of it."""
 
     images: list[UInt8[np.ndarray, "h w"]]
@@ -109,16 +109,16 @@ class Session:
         return KnownCamera(lens, (0.0, 0.0, 0.0, 0.0), self.camera_to_world[0])
 
 
-def simulated(case: Case, size_px: int, markers: bool) -> Session:
+def simulated(case: Case, size_px: int, markers: bool) -> KnownSession:
     """A session of our simulator."""
     if not markers:
         case = replace(case, changes={"markers": {"on_container": 0, "on_disc": 0}})
     simulation = Simulation(scene_of(case, size_px))
     info = known_info(simulation)
-    return Session(grey_images(simulation), simulation.intrinsics.fl_x, simulation.camera_to_world, info)
+    return KnownSession(grey_images(simulation), simulation.intrinsics.fl_x, simulation.camera_to_world, info)
 
 
-def path_traced(field_of_view_deg: float, size_px: int, markers: bool) -> Session:
+def path_traced(field_of_view_deg: float, size_px: int, markers: bool) -> KnownSession:
     """The path-traced session, whose lamps drift."""
     scene = PathTracedScene(
         PICTURE_NM,
@@ -144,7 +144,7 @@ def path_traced(field_of_view_deg: float, size_px: int, markers: bool) -> Sessio
         container_diameter_m=2.0 * CONTAINER_RADIUS_M,
         container_height_m=CONTAINER_HEIGHT_M,
     )
-    return Session(images, scene.focal_px, np.stack([camera_pose(a) for a in angles_deg]), info)
+    return KnownSession(images, scene.focal_px, np.stack([camera_pose(a) for a in angles_deg]), info)
 
 
 @dataclass(frozen=True)
@@ -165,15 +165,15 @@ class PosesWithoutMarkers:
         for name in self.objects:
             session = self._session(name, markers=False)
             for known, (info, camera) in what_is_known(session).items():
-                from_features = partial(poses_from_features, free=self._free_poses(name, session, camera))
-                self._write(name, known, _cells(session, info, camera, from_features))
+                from_sfm = partial(poses_from_sfm, free=self._free_poses(name, session, camera))
+                self._write(name, known, _cells(session, info, camera, from_sfm))
             session = self._session(name, markers=True)
             self._write(name, "markers", _cells(session, session.info, None, None))
 
     def _write(self, name: str, known: str, cells: tuple[str, ...]) -> None:
         write_results("poses_without_markers", COLUMNS, [(name, known, *cells)], keys=2, folder=self.results)
 
-    def _free_poses(self, name: str, session: Session, camera: KnownCamera | None) -> FreePoses:
+    def _free_poses(self, name: str, session: KnownSession, camera: KnownCamera | None) -> FreePoses:
         """What COLMAP finds in the session, with the focal length where it is known, unless the folder has it."""
         known = "" if camera is None else "_known_camera"
         path = self.folder / f"{name.replace(', ', '_')}_{self.size}_colmap{known}.pickle"
@@ -182,7 +182,7 @@ class PosesWithoutMarkers:
             path.write_bytes(pickle.dumps(structure_from_motion(session.images, session.names, focal_px=focal_px)))
         return pickle.loads(path.read_bytes())
 
-    def _session(self, name: str, markers: bool) -> Session:
+    def _session(self, name: str, markers: bool) -> KnownSession:
         """The session, rendered unless the folder has its pictures."""
         path = self.folder / f"{name.replace(', ', '_')}_{self.size}_{'markers' if markers else 'bare'}.npz"
         if not path.is_file():
@@ -196,10 +196,10 @@ class PosesWithoutMarkers:
             np.savez_compressed(path, made.images, made.focal_px, made.camera_to_world, info)
         with np.load(path) as kept:
             images, focal_px, camera_to_world, info = (kept[key] for key in kept)
-        return Session(list(images), float(focal_px), camera_to_world, SessionInfo(**json.loads(str(info))))
+        return KnownSession(list(images), float(focal_px), camera_to_world, SessionInfo(**json.loads(str(info))))
 
 
-def what_is_known(session: Session) -> dict[str, tuple[SessionInfo, KnownCamera | None]]:
+def what_is_known(session: KnownSession) -> dict[str, tuple[SessionInfo, KnownCamera | None]]:
     """What is known of a session without markers, case by case."""
     whole = session.info
     outline = SessionInfo(
@@ -219,18 +219,16 @@ def what_is_known(session: Session) -> dict[str, tuple[SessionInfo, KnownCamera 
 
 
 def _cells(
-    session: Session,
+    session: KnownSession,
     info: SessionInfo,
     camera: KnownCamera | None,
-    from_features: Callable[..., TurntablePoses] | None,
+    from_sfm: Callable[..., TurntablePoses] | None,
 ) -> tuple[str, ...]:
     try:
-        if from_features is None:
+        if from_sfm is None:
             poses = find_poses(session.images, session.names, info, "markers")
         else:
-            poses = find_poses(
-                session.images, session.names, info, "colmap", camera=camera, from_features=from_features
-            )
+            poses = find_poses(session.images, session.names, info, "colmap", camera=camera, from_sfm=from_sfm)
     except InputError as error:
         return (*("",) * 9, f"refused: {error}")
     rotation_deg, position_mm = _errors(session, poses)
@@ -266,7 +264,7 @@ def goal_met(found: list[float], stated: list[float]) -> str:
     return "stated" if ratio <= 1.0 else "within 2 stated" if ratio <= 2.0 else f"{ratio:.1f} stated"
 
 
-def _errors(session: Session, poses: TurntablePoses) -> tuple[float, float]:
+def _errors(session: KnownSession, poses: TurntablePoses) -> tuple[float, float]:
     """Largest errors of rotation, degrees, and of position, millimetres."""
     found, truth = poses.camera_to_world[poses.used].copy(), session.camera_to_world[poses.used]
     if not poses.metric:

@@ -29,7 +29,7 @@ from hsi_sc_nerf.evaluation.spatial import Surface, sample_surface, score_at
 from hsi_sc_nerf.export.options import CloudOptions
 from hsi_sc_nerf.export.spectral_export import export_cloud
 from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene
-from hsi_sc_nerf.models.trained_run import TrainedRun, open_run
+from hsi_sc_nerf.models.trained_run import TrainedRun, open_trained_run
 from hsi_sc_nerf.simulate.scores import true_reference
 from hsi_sc_nerf.simulate.truth import load_truth
 from hsi_sc_nerf.surface.depth_renders import DepthRenders, render_depth_maps
@@ -71,7 +71,7 @@ class SurfaceAccuracy:
     def main(self) -> None:
         """Export, measure, print the table, write the row."""
         mesh = load_truth(self.session).mesh()
-        run = open_run(self.load_config)
+        run = open_trained_run(self.load_config)
         cloud_m = fused_exact_depths(run, mesh) if self.exact_depths else exported(run)
         reference = true_reference(self.session, CompareConfig(whole_reference=False))
         assert reference.seen is not None

@@ -20,7 +20,7 @@ from traits_accuracy import EVERY_KTH_CAMERA, SPOTS, spots_on
 from true_object import TrueObject
 
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh
-from hsi_sc_nerf.analysis.size import combined, pixel_on_object_m, shared_errors, size_of, size_uncertainty
+from hsi_sc_nerf.analysis.size import combined, pixel_on_object_m, size_of, size_uncertainty, systematic_errors
 from hsi_sc_nerf.analysis.spectral_mesh import with_spectra
 from hsi_sc_nerf.analysis.traits import analyse
 from hsi_sc_nerf.benchmark.steps import run_step, typed_command
@@ -103,8 +103,8 @@ def measured(folder: Path) -> Iterator[tuple[str, float, float]]:
     true, cloud = TrueObject.of(truth), read_spectral_ply(folder / "export" / "point_cloud.ply")
     config = replace(MeshConfig(), base_height_m=float(true.mesh.vertices[:, 2].min()))
     mesh = closed_mesh(cloud.points, cloud.normals, config)
-    shared = shared_errors(dataset, base_known=True)
-    std = combined(size_uncertainty(cloud.points, cloud.normals, mesh, config, splits=3, shared=shared))
+    systematic = systematic_errors(dataset, base_known=True)
+    std = combined(size_uncertainty(cloud.points, cloud.normals, mesh, config, splits=3, systematic=systematic))
     size, exact = size_of(mesh), size_of(true.mesh)
     for name, trait in TRAITS.items():
         one = getattr(exact, name)

@@ -84,7 +84,7 @@ def judged(name: str, value: float, limits: tuple[float, float], sentence: str, 
 
 
 @dataclass(frozen=True)
-class Effect:
+class EffectEvidence:
     """One effect: how strong it is in a session, and whether it is to be simulated.
 
     Attributes:
@@ -106,7 +106,7 @@ class Effect:
     sentence: str
 
 
-def effect_rows(effects: Sequence[Effect]) -> list[list[str]]:
+def effect_rows(effects: Sequence[EffectEvidence]) -> list[list[str]]:
     """Rows of a table under `EFFECT_COLUMNS`."""
 
     def text(value: float | None) -> str:

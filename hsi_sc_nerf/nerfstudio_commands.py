@@ -155,10 +155,10 @@ def _export_spectral_cloud(options: Any) -> None:
     from hsi_sc_nerf.export.cloud import run_name
     from hsi_sc_nerf.export.options import CloudOptions
     from hsi_sc_nerf.export.spectral_export import export_cloud
-    from hsi_sc_nerf.models.trained_run import open_run
+    from hsi_sc_nerf.models.trained_run import open_trained_run
 
     cloud_options = CloudOptions.from_nerfstudio(options)
-    run = open_run(options.load_config)
+    run = open_trained_run(options.load_config)
     export_cloud(run, options.output_dir, cloud_options, run_name(options.load_config))
 
 

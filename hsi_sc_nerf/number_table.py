@@ -86,7 +86,7 @@ def read_number_table(path: Path, columns: int | None = None, blanks: Collection
         ]
     except csv.Error as error:
         raise ValueError(f"its quotation marks are not in pairs: {error}") from error
-    rows = _without_empty_columns([[cell.strip() for cell in row[:columns]] for row in rows])
+    rows = without_empty_columns([[cell.strip() for cell in row[:columns]] for row in rows])
     titles = () if all(_is_number(cell) for cell in rows[0]) else tuple(rows[0])
     rows, lines = rows[bool(titles) :], [number for number, _ in numbered[bool(titles) :]]
     rows = [["" if cell.lower() in blanks else cell for cell in row] for row in rows]
@@ -125,6 +125,12 @@ def numbers_in(text: str) -> list[float]:
     return [number_in(part) for part in text.split(";" if ";" in text else ",") if part.strip()]
 
 
+def without_empty_columns(rows: Sequence[list[str]]) -> list[list[str]]:
+    """The rows without the empty cells that a spreadsheet leaves at the right of all; one cell is kept at least."""
+    width = max((at for row in rows for at, cell in enumerate(row, start=1) if cell), default=1)
+    return [row[:width] for row in rows]
+
+
 def _text(path: Path) -> str:
     content = path.read_bytes()
     encoding = "utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
@@ -155,13 +161,6 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _without_empty_columns(rows: Sequence[list[str]]) -> list[list[str]]:
-    kept = max(len(row) for row in rows)
-    while kept > 1 and all(len(row) < kept or row[kept - 1] == "" for row in rows):
-        kept -= 1
-    return [row[:kept] for row in rows]
 
 
 def _name_and_nm(title: str) -> tuple[str, float]:

@@ -22,31 +22,6 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 
-def _wider(dtype: torch.dtype) -> torch.dtype:
-    return torch.float32 if dtype == torch.float16 else torch.float64
-
-
-def _within_range(values: Tensor, dtype: torch.dtype) -> Tensor:
-    """Cast to ``dtype``; finite values beyond its range become its largest number, non-finite ones stay."""
-    largest = torch.finfo(dtype).max
-    if torch.finfo(values.dtype).max <= largest:
-        return values.to(dtype)
-    return torch.where(values.isfinite(), values.clamp(-largest, largest), values).to(dtype)
-
-
-class _Widen(torch.autograd.Function):
-    """Cast to the wider type; the gradient is cast back without overflowing."""
-
-    @staticmethod
-    def forward(ctx, values: Tensor) -> Tensor:
-        ctx.dtype = values.dtype
-        return values.to(_wider(values.dtype))
-
-    @staticmethod
-    def backward(ctx, gradient: Tensor) -> Tensor:
-        return _within_range(gradient, ctx.dtype)
-
-
 def widen(values: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """Cast to the type that safe arithmetic runs in: float32 for float16, else float64.
 
@@ -204,3 +179,28 @@ def masked_mean(values: Float[Tensor, "*shape"], mask: Bool[Tensor, "*shape"] | 
     # To pick the selected values, a GPU would have to tell how many they are and be waited for.
     selected = widen(torch.where(mask, values, 0.0))
     return narrow(selected.sum() / mask.sum().clamp_min(1), values)
+
+
+def _wider(dtype: torch.dtype) -> torch.dtype:
+    return torch.float32 if dtype == torch.float16 else torch.float64
+
+
+def _within_range(values: Tensor, dtype: torch.dtype) -> Tensor:
+    """Cast to ``dtype``; finite values beyond its range become its largest number, non-finite ones stay."""
+    largest = torch.finfo(dtype).max
+    if torch.finfo(values.dtype).max <= largest:
+        return values.to(dtype)
+    return torch.where(values.isfinite(), values.clamp(-largest, largest), values).to(dtype)
+
+
+class _Widen(torch.autograd.Function):
+    """Cast to the wider type; the gradient is cast back without overflowing."""
+
+    @staticmethod
+    def forward(ctx, values: Tensor) -> Tensor:
+        ctx.dtype = values.dtype
+        return values.to(_wider(values.dtype))
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor) -> Tensor:
+        return _within_range(gradient, ctx.dtype)

@@ -65,6 +65,22 @@ def ctrl_c():
 
 
 @pytest.fixture
+def command(monkeypatch):
+    """Runs ``hsi-sc-nerf`` with the words it is given, in this process; the result is the exit status."""
+    from hsi_sc_nerf.cli.main import main
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", *map(str, words)])
+        try:
+            main()
+        except SystemExit as ended:
+            return ended.code
+        return 0
+
+    return run
+
+
+@pytest.fixture
 def limit_of_files(monkeypatch):
     """Context of a limit to the size of files in bytes, which stands for a full disk."""
 

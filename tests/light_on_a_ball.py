@@ -4,7 +4,7 @@ import numpy as np
 import scipy.sparse
 
 from hsi_sc_nerf.light.stationary_light import even_directions
-from hsi_sc_nerf.light.views import Transfer, TurningElements, Views
+from hsi_sc_nerf.light.views import ElementViews, Transfer, TurningElements
 
 DIRECTIONS = even_directions(2048)
 TO_LAMP = np.array([-0.5, 0.55, 0.67]) / np.linalg.norm([-0.5, 0.55, 0.67])
@@ -12,8 +12,8 @@ FACING = np.array([0.0, 0.0, 1.0])
 FRAMES, RADIUS_M, ELEVATION = 12, 0.04, 0.4
 
 
-def turning_ball(count: int = 300, places_m: np.ndarray | float = 0.0) -> TurningElements:
-    """Elements of a ball that sees no other, or of parts of such balls at some places, before a turning camera."""
+def turning_ball(count: int = 300, centres_m: np.ndarray | float = 0.0) -> TurningElements:
+    """Elements of a ball that sees no other, or parts of such balls about some centres, before a turning camera."""
     normals = even_directions(count)
     cosines = np.maximum(normals @ DIRECTIONS.T, 0.0)
     transfer = Transfer(
@@ -26,7 +26,7 @@ def turning_ball(count: int = 300, places_m: np.ndarray | float = 0.0) -> Turnin
         rotations.append(np.stack([right, np.cross(back, right), back], axis=1))
     on_object = np.ones(count, bool)
     return TurningElements(
-        RADIUS_M * normals + places_m, normals, on_object, transfer, DIRECTIONS, np.array(rotations)
+        RADIUS_M * normals + centres_m, normals, on_object, transfer, DIRECTIONS, np.array(rotations)
     )
 
 
@@ -52,4 +52,4 @@ def measured(ball, lamp, seed=0, noise=0.005, lamp_colour=(1.0, 1.0), distance_m
     element, irradiance = np.concatenate(element), np.concatenate(irradiance)
     shown = material[element] * irradiance * (1.0 + noise * rng.standard_normal((len(element), 1)))
     of_object, no_std = np.ones(len(element), bool), np.zeros(len(element))
-    return Views(element, np.concatenate(frame), shown, of_object, no_std), irradiance, material
+    return ElementViews(element, np.concatenate(frame), shown, of_object, no_std), irradiance, material

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-from killed_commands import Command, Moment, goes_on_after_ctrl_c, in_pieces, main, moments, start, undisturbed
+from killed_commands import KilledCommand, Moment, goes_on_after_ctrl_c, in_pieces, main, moments, start, undisturbed
 from left_files import differences, files_in, half_written, leftovers
 
 from hsi_sc_nerf.files import atomic_write, write_json
@@ -22,7 +22,7 @@ from hsi_sc_nerf.files import atomic_write, write_json
 @pytest.mark.slow
 def test_process_killed_again_and_again_goes_on_to_the_same_dataset(tiny_dataset, tmp_path):
     data, session = tiny_dataset
-    command = Command("process", ("hsi-sc-nerf", "process", str(session), "--output-dir", "out"))
+    command = KilledCommand("process", ("hsi-sc-nerf", "process", str(session), "--output-dir", "out"))
     out = tmp_path / "out"
     # Calibration and frames; poses; masks, effects and the end.
     for sign in (".cache/*.note", "poses.json", "masks/*.png"):
@@ -143,6 +143,6 @@ def test_an_undisturbed_run_has_its_moments_until_all_is_written(tmp_path, monke
     work = "import time, pathlib as p\ndef work(s):\n    while time.process_time() < s: pass\n"
     work += "p.Path('out').mkdir(); work(0.3); p.Path('out/a').touch(); work(0.6); p.Path('out/b').touch(); work(1.2)"
     monkeypatch.setattr("killed_commands.typed_command", lambda words: [sys.executable, "-c", work])
-    first_file_s, written_s, seconds = undisturbed(Command("a", ()), tmp_path)
+    first_file_s, written_s, seconds = undisturbed(KilledCommand("a", ()), tmp_path)
     assert 0.2 < first_file_s < written_s < seconds - 0.3
     assert all(moment.after_s < written_s for moment in moments(4, first_file_s, written_s, random.Random(0)))

@@ -21,7 +21,7 @@ from hsi_sc_nerf.config import hsi_sc_nerf
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.models import staged_trainer
 from hsi_sc_nerf.models.run_settings import read_config
-from hsi_sc_nerf.models.trained_run import open_run
+from hsi_sc_nerf.models.trained_run import open_trained_run
 
 
 def command(kind, path, **options):
@@ -136,7 +136,7 @@ NO_RUNS = {
 
 @pytest.mark.parametrize("case", NO_RUNS)
 def test_what_is_no_run_is_one_sentence(ours, tmp_path, case):
-    """In nerfstudio's commands, and in `open_run`, by which all of ours open a run."""
+    """In nerfstudio's commands, and in `open_trained_run`, by which all of ours open a run."""
     spoil, told = NO_RUNS[case]
     spoil(ours)
     before = sorted(tmp_path.rglob("*"))
@@ -145,9 +145,9 @@ def test_what_is_no_run_is_one_sentence(ours, tmp_path, case):
         options: dict = {"output_path": Path("scores.json"), "downscale_factor": None, "rendered_output_names": None}
         with pytest.raises(SystemExit, match=sentence):
             adapter._adapted(lambda self: pytest.fail("it was called"))(command(kind, ours, **options))
-    if case != "stray file":  # which open_run passes by
+    if case != "stray file":  # which open_trained_run passes by
         with pytest.raises(InputError, match=sentence):
-            open_run(ours)
+            open_trained_run(ours)
     assert sorted(tmp_path.rglob("*")) == before
 
 

@@ -1,9 +1,9 @@
-"""The robust standard deviation: that of normal values, whatever almost half of the values are."""
+"""The robust standard deviation and weights: those of normal values, whatever almost half of the values are."""
 
 import numpy as np
 import pytest
 
-from hsi_sc_nerf.robust_scatter import robust_std
+from hsi_sc_nerf.robust_scatter import TUKEY, robust_std, tukey_weights
 
 
 def test_normal_values_and_wild_ones():
@@ -19,3 +19,10 @@ def test_normal_values_and_wild_ones():
 def test_values_without_scatter_have_the_least():
     assert robust_std(np.zeros(5), least=0.01) == 0.01
     assert robust_std(np.zeros(5)) == 0.0
+
+
+def test_weights_fall_from_one_to_zero_at_the_cut_off():
+    std = np.array([1.0, 0.5])
+    deviation = np.array([[0.0, 0.0], [-TUKEY / 2.0, TUKEY / 4.0], [1.001 * TUKEY, -TUKEY], [np.nan, 1e9]])
+    found = tukey_weights(deviation, std)
+    np.testing.assert_allclose(found, [[1.0, 1.0], [0.5625, 0.5625], [0.0, 0.0], [0.0, 0.0]])

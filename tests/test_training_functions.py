@@ -77,8 +77,8 @@ def shading():
     """A shading that has learned something, of a soft ball."""
     torch.manual_seed(0)
     made = CameraShading((9, 9, 9), -torch.ones(3), 2.0 / 9.0, 3, torch.from_numpy(POSE), torch.zeros(3), -0.5)
-    places = torch.stack(torch.meshgrid(*[torch.arange(9) - 4.0] * 3, indexing="ij"), dim=-1)
-    made.refresh(torch.sigmoid(3.0 - places.norm(dim=-1)))
+    positions = torch.stack(torch.meshgrid(*[torch.arange(9) - 4.0] * 3, indexing="ij"), dim=-1)
+    made.refresh(torch.sigmoid(3.0 - positions.norm(dim=-1)))
     with torch.no_grad():
         for parameter in made.parameters():
             parameter.add_(0.3 * torch.randn(parameter.shape))

@@ -197,6 +197,12 @@ def read_calibration(path: Path | str) -> Calibration:
 
     Raises:
         InputError: the table or the model cannot be read, or does not hold what it needs.
+
+    Example:
+        >>> text = "# intercept: 2\\nwavelength_nm,coefficient\\n500,1\\n700,10\\n"
+        >>> _ = Path("dry_matter.csv").write_text(text)
+        >>> read_calibration("dry_matter.csv").predict(np.array([[0.1, 0.3]])).round(3)
+        array([[5.1]])
     """
     path = Path(path)
     try:

@@ -36,7 +36,7 @@ class ClassChange:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class DayComparison:
     """A day beside the first one, and its areas beside those of the day before it.
 
     Attributes:
@@ -66,7 +66,7 @@ def compare_days(
     library: SpectralLibrary | None = None,
     angle_rad: float = np.inf,
     repeat: Day | None = None,
-) -> Iterable[Comparison]:
+) -> Iterable[DayComparison]:
     """Compare each day with the first, one after the other.
 
     Args:
@@ -80,6 +80,12 @@ def compare_days(
 
     Raises:
         InputError: too little is seen on both days, or the library or a wavelength does not fit the bands.
+
+    Example:
+        >>> days = days_on_one_mesh(clouds, ("monday", "friday"), MeshConfig(), 65.0)
+        >>> indices = find_indices(["NDVI"], clouds[0].wavelengths_nm)
+        >>> for one in compare_days(days, (670.0,), indices, 0.01):
+        ...     print(one.after.name, [region.area_m2 for region in one.quantities["NDVI"].regions])
     """
     first, earlier = days[0], None
     mesh, areas_m2 = first.surface.mesh, first.surface.areas_m2
@@ -98,7 +104,7 @@ def compare_days(
                 name: grown_regions(mesh, areas_m2, class_map.before == number, class_map.after == number)
                 for number, name in enumerate(class_map.names)
             }
-        yield Comparison(first.name, after, quantities, before.name, grown, classes, class_map)
+        yield DayComparison(first.name, after, quantities, before.name, grown, classes, class_map)
         earlier = quantities
 
 

@@ -65,6 +65,10 @@ def days_on_one_mesh(
 
     Raises:
         InputError: the clouds have other bands, a cloud is too small, or a day cannot be registered.
+
+    Example:
+        >>> clouds = [read_spectral_ply(Path(day, "point_cloud.ply")) for day in ("monday", "friday")]
+        >>> days = days_on_one_mesh(clouds, ("monday", "friday"), MeshConfig(), 65.0)
     """
     nm = clouds[0].wavelengths_nm
     for cloud, name in zip(clouds, names, strict=True):

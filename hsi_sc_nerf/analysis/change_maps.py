@@ -11,8 +11,7 @@ from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.analysis.change_days import Day
 from hsi_sc_nerf.analysis.change_features import COMPONENTS, surface_gradients, unit_spectra
-from hsi_sc_nerf.analysis.change_limit import limit_of_blank_m2
-from hsi_sc_nerf.analysis.change_regions import OUTSIDE, ChangedRegion, changed_regions
+from hsi_sc_nerf.analysis.change_regions import OUTSIDE, ChangedRegion, changed_regions, limit_of_blank_m2
 from hsi_sc_nerf.analysis.change_significance import (
     FALSE_DISCOVERIES,
     Significance,
@@ -47,7 +46,7 @@ class Quantity:
         test: of the patches and of the whole surface.
         region: number of each vertex's region, -1 outside.
         regions: areas that changed beyond noise, and otherwise than the whole surface, the largest first.
-        limit_m2: regions up to this area are undecided (`hsi_sc_nerf.analysis.change_limit`); 0 with a repeat.
+        limit_m2: regions up to this area are undecided (`limit_of_blank_m2`); 0 with a repeat.
     """
 
     name: str
@@ -139,8 +138,8 @@ def changes(
         each_day = zip(days, values, strict=True)
         first, last, *again = (np.where(day.surface.seen[:, None], each, np.nan) for day, each in each_day)
         of_patches, *of_repeat = (patches.means(each - first, one.areas_m2) for each in (last, *again))
-        slopes = np.linalg.norm(surface_gradients(patches.centres_m, patches.means(first, one.areas_m2)), axis=2)
-        off = np.nan_to_num(slopes) * misplaced_m * (name != SURFACE)
+        gradients = np.linalg.norm(surface_gradients(patches.centres_m, patches.means(first, one.areas_m2)), axis=2)
+        off = np.nan_to_num(gradients) * misplaced_m * (name != SURFACE)
         errors = of_repeat[0] if of_repeat else None
         at_rim = to_rim_m < RIM_M
         test = significance(of_patches, patches.centres_m, off, shared, conditions, errors, at_rim, quantities)

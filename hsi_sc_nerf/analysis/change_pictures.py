@@ -12,7 +12,7 @@ from matplotlib import colormaps, rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.analysis.change import Comparison
+from hsi_sc_nerf.analysis.change import DayComparison
 from hsi_sc_nerf.analysis.change_days import Day
 from hsi_sc_nerf.analysis.change_maps import SPECTRUM, Quantity
 from hsi_sc_nerf.analysis.change_significance import FALSE_DISCOVERIES
@@ -37,7 +37,7 @@ _BOTH_WAYS = "RdBu_r"
 
 
 @rc_context(STYLE)
-def draw_change(path: Path, first: Day, one: Comparison, quantity: Quantity, views: SideViews) -> None:
+def draw_change(path: Path, first: Day, one: DayComparison, quantity: Quantity, views: SideViews) -> None:
     """A quantity on the four sides: before, after, its change, and the p-values; grey is not seen on both days.
 
     Regions up to the limit of blank are striped.
@@ -58,7 +58,7 @@ def draw_change(path: Path, first: Day, one: Comparison, quantity: Quantity, vie
 
 
 @rc_context(STYLE)
-def draw_class_change(path: Path, first: Day, one: Comparison, views: SideViews) -> None:
+def draw_class_change(path: Path, first: Day, one: DayComparison, views: SideViews) -> None:
     """The classes on the four sides: before, after, and the new class where it is another one; grey is unseen.
 
     Raises:
@@ -80,7 +80,7 @@ def draw_class_change(path: Path, first: Day, one: Comparison, views: SideViews)
 
 
 @rc_context(STYLE)
-def write_film(path: Path, first: Day, comparisons: Sequence[Comparison], views: SideViews, shown: str) -> None:
+def write_film(path: Path, first: Day, comparisons: Sequence[DayComparison], views: SideViews, shown: str) -> None:
     """The days one after the other on one mesh, faded into each other: pseudo-RGB, and change since the first.
 
     Args:

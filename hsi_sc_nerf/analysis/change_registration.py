@@ -19,7 +19,7 @@ from hsi_sc_nerf.analysis.change_features import SurfaceSample, surface_gradient
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.registration import robust_radius
 from hsi_sc_nerf.geometry.camera import Similarity, rotation_about_z
-from hsi_sc_nerf.robust_scatter import robust_std
+from hsi_sc_nerf.robust_scatter import TUKEY, robust_std, tukey_weights
 
 SCALE_RANGE = (0.8, 1.25)
 """Growth beyond this is another object, or other units."""
@@ -35,7 +35,6 @@ FINE_ATTITUDES = 4
 """The best of the coarse ones, which are fitted again to the fine sample."""
 COARSE_ROUNDS, FINE_ROUNDS = 25, 30
 CONVERGED = 1e-5
-TUKEY = 4.685
 _OFF_EDGE = 1.5
 """Pairs further apart along the surface than this, in spacings, lie beyond the reference's edge."""
 _PARAMETERS = 7
@@ -91,7 +90,7 @@ def find_attitude(
     Raises:
         InputError: the objects do not fit, differ too much in size, or fit in two attitudes equally well.
     """
-    (coarse, fine), (thinned, target) = moving, (_Target(one) for one in reference)
+    (coarse, fine), (thinned, target) = moving, (_FixedSample(one) for one in reference)
     found = [_fitted(coarse, thinned, start, COARSE_ROUNDS) for start in track(_starts(coarse, thinned.sample))]
     scales = _scales(coarse, thinned, min(found, key=lambda one: _loss(coarse, thinned, one, None).mean()))
     found.sort(key=lambda one: _loss(coarse, thinned, one, scales).mean())
@@ -118,7 +117,7 @@ def find_attitude(
     return best
 
 
-class _Target:
+class _FixedSample:
     """The reference's sample with its search tree and the gradients of its features along the surface."""
 
     def __init__(self, sample: SurfaceSample) -> None:
@@ -134,9 +133,9 @@ class _Target:
         offset, normals = points - self.sample.points[at], self.sample.normals[at]
         off = np.einsum("ij,ij->i", offset, normals)
         paired = np.linalg.norm(offset - off[:, None] * normals, axis=1) < _OFF_EDGE * self.spacing_m
-        slopes = np.concatenate([normals[:, None], self.gradients[at]], axis=1)
+        gradients = np.concatenate([normals[:, None], self.gradients[at]], axis=1)
         values = np.concatenate([np.zeros((len(at), 1)), self.sample.features[at] - features], axis=1)
-        return values + np.einsum("nfj,nj->nf", slopes, offset), slopes, paired
+        return values + np.einsum("nfj,nj->nf", gradients, offset), gradients, paired
 
 
 def _starts(moving: SurfaceSample, reference: SurfaceSample) -> list[Similarity]:
@@ -155,7 +154,7 @@ def _distinct(ranked: Sequence[Similarity]) -> list[Similarity]:
     return kept
 
 
-def _fitted(moving: SurfaceSample, target: _Target, start: Similarity, rounds: int) -> Similarity:
+def _fitted(moving: SurfaceSample, target: _FixedSample, start: Similarity, rounds: int) -> Similarity:
     transform = start
     for _ in range(rounds):
         matrix, gradients, centre = _system(moving, target, transform)
@@ -169,32 +168,34 @@ def _fitted(moving: SurfaceSample, target: _Target, start: Similarity, rounds: i
 
 
 def _system(
-    moving: SurfaceSample, target: _Target, transform: Similarity
+    moving: SurfaceSample, target: _FixedSample, transform: Similarity
 ) -> tuple[Float[np.ndarray, "7 7"], Float[np.ndarray, "n 7"], Float[np.ndarray, "3"]]:
     """Normal matrix and each point's gradient of the loss by shift, turn and growth about the centre, and that."""
     points = transform(moving.points)
     centre = points.mean(axis=0)
-    residual, slopes, paired = target.residuals(points, moving.features)
+    residual, gradients, paired = target.residuals(points, moving.features)
     scale = robust_std(residual[paired] if paired.sum() > _PARAMETERS else residual, axis=0, least=_LEAST_SCATTER)
-    weight = np.square(np.clip(1.0 - np.square(residual / (TUKEY * scale)), 0.0, None)) * paired[:, None]
+    weight = tukey_weights(residual, scale) * paired[:, None]
     # Off the surface, spectra mean nothing.
     weight[:, 1:] *= weight[:, :1]
     weight /= np.square(scale)
     arm = (points - centre)[:, None, :]
-    jacobian = np.concatenate([slopes, np.cross(arm, slopes), (slopes * arm).sum(axis=2, keepdims=True)], axis=2)
+    jacobian = np.concatenate(
+        [gradients, np.cross(arm, gradients), (gradients * arm).sum(axis=2, keepdims=True)], axis=2
+    )
     matrix = np.einsum("nfi,nf,nfj->ij", jacobian, weight, jacobian)
     # What nothing determines does not move.
     matrix += np.diag(1e-9 * np.diag(matrix) + 1e-30)
     return matrix, np.einsum("nfi,nf->ni", jacobian, weight * residual), centre
 
 
-def _scales(moving: SurfaceSample, target: _Target, transform: Similarity) -> Float[np.ndarray, "1+f"]:
+def _scales(moving: SurfaceSample, target: _FixedSample, transform: Similarity) -> Float[np.ndarray, "1+f"]:
     residual, _, paired = target.residuals(transform(moving.points), moving.features)
     return robust_std(residual[paired], axis=0, least=_LEAST_SCATTER)
 
 
 def _loss(
-    moving: SurfaceSample, target: _Target, transform: Similarity, scales: Float[np.ndarray, "1+f"] | None
+    moving: SurfaceSample, target: _FixedSample, transform: Similarity, scales: Float[np.ndarray, "1+f"] | None
 ) -> Float[np.ndarray, "n"]:
     """Tukey's loss of each point, 1 for a lost one; without scales, in units of the whole reference's spread."""
     residual, _, paired = target.residuals(transform(moving.points), moving.features)
@@ -207,7 +208,7 @@ def _loss(
     return np.where(paired, loss.mean(axis=1), 1.0)
 
 
-def _attitude(moving: SurfaceSample, target: _Target, ranked: Sequence[Similarity]) -> Attitude:
+def _attitude(moving: SurfaceSample, target: _FixedSample, ranked: Sequence[Similarity]) -> Attitude:
     best = ranked[0]
     matrix, gradients, _ = _system(moving, target, best)
     block = _blocks(moving.points)

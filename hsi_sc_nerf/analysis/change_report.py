@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from hsi_sc_nerf.analysis.change import Comparison
+from hsi_sc_nerf.analysis.change import DayComparison
 from hsi_sc_nerf.analysis.change_days import Day
 from hsi_sc_nerf.analysis.change_maps import SPECTRUM, SURFACE
-from hsi_sc_nerf.analysis.spectral_mesh import write_mesh
+from hsi_sc_nerf.analysis.report import CM2_PER_M2
+from hsi_sc_nerf.analysis.spectral_mesh import write_spectral_mesh
 from hsi_sc_nerf.files import atomic_write, nan_to_none, write_json
 from hsi_sc_nerf.terminal import markdown_table, markdown_text
 
@@ -27,11 +28,10 @@ COLUMNS = (
 WHOLE = "whole surface"
 CHANGED, UNDECIDED = "change", "undecided"
 """Kinds of rows: regions that count, and those up to the limit of blank."""
-_CM2_PER_M2 = 1e4
 _PAGE_REGIONS = 12
 
 
-def change_rows(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
+def change_rows(comparisons: Sequence[DayComparison]) -> list[dict[str, Any]]:
     """The rows of change.csv: of each quantity the whole surface and its regions, those up to the limit of blank as a
     kind of their own; areas grown since the day before, and regions of classes that changed. Absent numbers are None.
     """
@@ -51,7 +51,7 @@ def change_rows(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
                 if name != SPECTRUM:
                     told["change_sd"] = float(quantity.test.noise[0])
                 told |= _areas(0.0, region.area_m2, region.centre_m) | {
-                    "area_change_sd_cm2": _CM2_PER_M2 * region.area_sd_m2
+                    "area_change_sd_cm2": CM2_PER_M2 * region.area_sd_m2
                 }
                 rows.append(head | {"kind": CHANGED if number < quantity.counted else UNDECIDED} | told)
         # Beside the first day, the regions themselves are what grew.
@@ -68,14 +68,14 @@ def change_rows(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
 
 
 def _areas(before_m2: float, after_m2: float, centre_m: Sequence[float] = ()) -> dict[str, float]:
-    before, after = _CM2_PER_M2 * before_m2, _CM2_PER_M2 * after_m2
+    before, after = CM2_PER_M2 * before_m2, CM2_PER_M2 * after_m2
     told = {"area_before_cm2": before, "area_after_cm2": after, "area_change_cm2": after - before}
     return told | dict(zip(("x_mm", "y_mm", "z_mm"), (1e3 * x for x in centre_m), strict=False))
 
 
-def write_tables(
+def write_change_tables(
     folder: Path,
-    comparisons: Sequence[Comparison],
+    comparisons: Sequence[DayComparison],
     settings: Mapping[str, Any],
     pictures: Mapping[str, str],
     repeat: Day | None = None,
@@ -114,7 +114,7 @@ def write_tables(
 
 
 def _content(
-    comparisons: Sequence[Comparison],
+    comparisons: Sequence[DayComparison],
     rows: Sequence[Mapping[str, Any]],
     settings: Mapping[str, Any],
     repeat: Day | None,
@@ -147,7 +147,7 @@ def _placed(day: Day) -> dict[str, Any]:
     return {"name": day.name, "attitude": nan_to_none(attitude)}
 
 
-def _set_down(comparisons: Sequence[Comparison], repeat: Day | None) -> list[str]:
+def _set_down(comparisons: Sequence[DayComparison], repeat: Day | None) -> list[str]:
     rows = []
     for day in (*(one.after for one in comparisons), *([] if repeat is None else [repeat])):
         found = day.attitude
@@ -169,13 +169,13 @@ def _set_down(comparisons: Sequence[Comparison], repeat: Day | None) -> list[str
     return ["## How the object was set down", markdown_table([*header, "next best attitude"], rows), note]
 
 
-def _undecided(comparisons: Sequence[Comparison], rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def _undecided(comparisons: Sequence[DayComparison], rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """What the limit of blank is and which regions are below it; nothing with a repeat."""
     limit_m2 = max(_limit_m2(one) for one in comparisons)
     if limit_m2 == 0.0:
         return []
     told = (
-        f"Two captures of one day show regions of up to {_CM2_PER_M2 * limit_m2:.2g} cm² that are no change (limit "
+        f"Two captures of one day show regions of up to {CM2_PER_M2 * limit_m2:.2g} cm² that are no change (limit "
         "of blank). "
     )
     if not rows:
@@ -186,7 +186,7 @@ def _undecided(comparisons: Sequence[Comparison], rows: Sequence[Mapping[str, An
     return ["## Undecided: below the limit of blank", told, *_table(rows)]
 
 
-def _limit_m2(one: Comparison) -> float:
+def _limit_m2(one: DayComparison) -> float:
     return max(quantity.limit_m2 for quantity in one.quantities.values())
 
 
@@ -206,7 +206,7 @@ def _cell(value: Any, numbers: str = ".6g") -> str:
     return format(value, numbers) if isinstance(value, float) else str(value)
 
 
-def write_change_ply(path: Path, first: Day, comparisons: Sequence[Comparison]) -> None:
+def write_change_ply(path: Path, first: Day, comparisons: Sequence[DayComparison]) -> None:
     """The first day's mesh and spectra; of each later day change, p-value and region of each quantity.
 
     Columns are named ``QUANTITY_KIND_DAY``: ``ndvi_change_1``, ``ndvi_p_1`` and ``ndvi_region_1`` of the second
@@ -223,4 +223,4 @@ def write_change_ply(path: Path, first: Day, comparisons: Sequence[Comparison]) 
             extra[f"{word}_region_{day}"] = np.where(quantity.undecided, -1.0, 1.0) * (quantity.region + 1.0)
         if one.class_map is not None:
             extra |= {"class_before": one.class_map.before, f"class_after_{day}": one.class_map.after}
-    write_mesh(path, first.surface, {name: column.astype(np.float32) for name, column in extra.items()})
+    write_spectral_mesh(path, first.surface, {name: column.astype(np.float32) for name, column in extra.items()})

@@ -185,7 +185,12 @@ def _largest_around(
 
 
 def hotelling_p(squares: Float[np.ndarray, "*n"], dimensions: int, observations: float) -> Float[np.ndarray, "*n"]:
-    """Chance of a larger T² of so many numbers whose variances come from so many observations (Hotelling 1931)."""
+    """p-value of T² (Hotelling 1931): the probability of a larger one.
+
+    Args:
+        dimensions: number of the values that T² combines.
+        observations: number of observations that their variances are estimated from.
+    """
     free = observations - 1.0
     last = free - dimensions + 1.0
     return stats.f.sf(squares * last / (dimensions * free), dimensions, last)

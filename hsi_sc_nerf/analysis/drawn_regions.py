@@ -96,6 +96,12 @@ def write_drawn_regions(path: Path | str, regions: Sequence[DrawnRegion]) -> Non
 
     Raises:
         InputError: the file cannot be written.
+
+    Example:
+        >>> points_m = np.array([[0.0, 0.0, 0.01], [0.0, 0.0, 0.09]])
+        >>> write_drawn_regions("regions.json", [DrawnRegion("top", points_m, points_m[:, 2] > 0.05)])
+        >>> read_drawn_regions("regions.json")[0].chosen
+        array([False,  True])
     """
     content = {
         "kind": KIND,

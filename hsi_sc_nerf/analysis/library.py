@@ -88,6 +88,11 @@ def read_library(path: Path) -> SpectralLibrary:
 
     Raises:
         InputError: the file is missing, is neither of the two, or holds numbers that cannot be read.
+
+    Example:
+        >>> _ = Path("materials.csv").write_text("wavelength_nm,skin,leaf\\n500,0.1,0.2\\n700,0.6,0.3\\n")
+        >>> read_library(Path("materials.csv")).names
+        ('skin', 'leaf')
     """
     path = Path(path)
     if not path.is_file():

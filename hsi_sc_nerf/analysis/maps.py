@@ -15,7 +15,7 @@ from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.indices.formula import SpectralIndex, index_values
 
 _STEP = 1e-4
-"""Change of a reflectance that slopes are taken over: small beside reflectance, large beside rounding."""
+"""Step of a reflectance in numerical gradients: small beside reflectance, large beside rounding."""
 _CAPTION_LETTERS = 40
 
 
@@ -83,7 +83,7 @@ def propagated_std(
 
     Args:
         of: the function, of many spectra at once.
-        spectrum: where its slopes are taken.
+        spectrum: where its gradient is taken.
         std: standard deviation of each band or of all.
 
     Example:
@@ -93,5 +93,5 @@ def propagated_std(
     if not np.isfinite(std).all():
         return math.nan
     steps = _STEP * np.eye(len(spectrum))
-    slopes = (of(spectrum + steps) - of(spectrum - steps)) / (2.0 * _STEP)
-    return float(np.sqrt(np.sum((slopes * std) ** 2)))
+    gradient = (of(spectrum + steps) - of(spectrum - steps)) / (2.0 * _STEP)
+    return float(np.sqrt(np.sum((gradient * std) ** 2)))

@@ -14,14 +14,12 @@ from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
 from hsi_sc_nerf.analysis.drawn_regions import DrawnRegion
 from hsi_sc_nerf.analysis.measurement import Measurement, measure_traits, on_container
 from hsi_sc_nerf.analysis.measurement_files import delete_earlier, write_measurement
-from hsi_sc_nerf.analysis.report import PIECES, trait_tables
+from hsi_sc_nerf.analysis.report import MM_PER_M, PIECES, trait_tables
 from hsi_sc_nerf.analysis.standing_pieces import standing_pieces
 from hsi_sc_nerf.export.cloud import SpectralCloud
 from hsi_sc_nerf.files import atomic_write, make_folder, write_json
 from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.terminal import markdown_table, markdown_text
-
-_MM_PER_M = 1000.0
 
 
 def measure_pieces(
@@ -132,7 +130,7 @@ def _page(contents: Sequence[Mapping[str, Any]], name: str) -> str:
     rows = [
         [
             str(content["piece"]),
-            *(f"{_MM_PER_M * at:.1f}" for at in content["centre_m"][:2]),
+            *(f"{MM_PER_M * at:.1f}" for at in content["centre_m"][:2]),
             *(value for _, value, _ in size),
         ]
         for content, size in zip(contents, sizes, strict=True)

@@ -22,10 +22,10 @@ from hsi_sc_nerf.analysis.report import component_content, trait_content
 from hsi_sc_nerf.analysis.size import (
     Size,
     pixel_on_object_m,
-    shared_errors,
     size_of,
     size_uncertainty,
     sizes_to_find,
+    systematic_errors,
 )
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, with_spectra
 from hsi_sc_nerf.analysis.standing_pieces import one_piece
@@ -132,9 +132,11 @@ def measure_traits(
         closed = closed_mesh(cloud.points, cloud.normals, config)
     uncertainty: dict[str, Size] = {}
     if splits:
-        shared = None if dataset is None else shared_errors(dataset, base_known=config.base_height_m is not None)
-        with progress_bar("uncertainty", "meshes", sizes_to_find(splits, shared)) as done:
-            uncertainty = size_uncertainty(cloud.points, cloud.normals, closed, config, splits, shared, done=done)
+        systematic = (
+            None if dataset is None else systematic_errors(dataset, base_known=config.base_height_m is not None)
+        )
+        with progress_bar("uncertainty", "meshes", sizes_to_find(splits, systematic)) as done:
+            uncertainty = size_uncertainty(cloud.points, cloud.normals, closed, config, splits, systematic, done=done)
     with console.status("spectra on the surface"):
         surface = with_spectra(closed, cloud, config.smoothing_radius_m, max_incidence_deg)
         classes = classified(surface, library, angle_rad) if library else None

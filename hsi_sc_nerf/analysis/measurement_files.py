@@ -15,7 +15,7 @@ from hsi_sc_nerf.analysis import pictures, report
 from hsi_sc_nerf.analysis.class_maps import rest_words
 from hsi_sc_nerf.analysis.library import write_library
 from hsi_sc_nerf.analysis.measurement import Measurement
-from hsi_sc_nerf.analysis.spectral_mesh import write_mesh
+from hsi_sc_nerf.analysis.spectral_mesh import write_spectral_mesh
 from hsi_sc_nerf.analysis.traits import Traits
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write, write_json
@@ -84,12 +84,12 @@ def write_measurement(folder: Path | str, measured: Measurement, name: str) -> d
         if of_picture:
             pictures.draw_maps(folder / picture, of_picture, surface, views)
             drawn[caption] = picture
-    write_mesh(folder / "mesh.ply", surface, extra)
+    write_spectral_mesh(folder / "mesh.ply", surface, extra)
     write_spectra(folder / "spectra.csv", surface.wavelengths_nm, traits)
     write_library(folder / "regions.sli", measured.region_spectra())
     content = replace(measured, settings={"cloud": name, **measured.settings}).content()
     write_json(folder / "traits.json", content)
-    report.write_page(folder / "traits.md", name, content, drawn)
+    report.write_traits_page(folder / "traits.md", name, content, drawn)
     delete_earlier(folder, keep=(*_TABLES, *drawn.values()))
     return content
 

@@ -34,8 +34,8 @@ _LONG = 2.0
 """Height over width of an ear, at least."""
 _SMALL = 0.1
 """Largest fraction of the points in a calyx, and in a part at a side: what is larger there is a blush."""
-_PLACES, _BEST_PLACES = 1000, 12
-"""Places at the sides that are tried, 4 mm apart on an apple, and how many of them are then moved."""
+_CENTRES, _BEST_CENTRES = 1000, 12
+"""Centres of parts at the sides that are tried, 4 mm apart on an apple, and how many of them are then moved."""
 _LOWEST, _LEAST_EVENNESS = 0.01, 0.9
 """A part begins at the lower edge if it has some of the lowest points, this fraction of them. The contrast of its
 middle third to the rest, over that of its lower third: near 1 for an organ, whose upper third training may blur, and
@@ -156,9 +156,9 @@ def _part_at_side(surface: _Surface, rest: Bool[np.ndarray, "n"]) -> _Part | Non
         # A larger part would be none of a side, and hide small ones.
         distances = (np.linalg.norm(sample - centre, axis=1) for centre in centres)
         found = (sharpest_edge(distance, some, every, largest=_SMALL) for distance in distances)
-        return sorted((edge for edge in found if edge.separation), key=lambda edge: -edge.separation)[:_BEST_PLACES]
+        return sorted((edge for edge in found if edge.separation), key=lambda edge: -edge.separation)[:_BEST_CENTRES]
 
-    best = edges(map(middle, edges(map(middle, edges(sample[_spread(sample, _PLACES)])))))
+    best = edges(map(middle, edges(map(middle, edges(sample[_spread(sample, _CENTRES)])))))
     if not best:
         return None
     edge = sharpest_edge(np.linalg.norm(points_m - middle(best[0]), axis=1), features, rest, largest=_SMALL)

@@ -37,7 +37,7 @@ _CAUSES = {
     "surface": "the place of the surface",
 }
 """Words for the causes of `size_uncertainty`."""
-_CM2_PER_M2 = 1e4
+CM2_PER_M2, MM_PER_M = 1e4, 1e3
 _LISTED_REGIONS = 20
 _ROUNDING = 1e-6
 """A smaller standard deviation, as a fraction of the value, is that of single precision."""
@@ -141,7 +141,7 @@ def trait_tables(content: Mapping[str, Any]) -> list[TraitTable]:
     """
     size, spread, seen_m2 = content["size"], content["size_sd"], content["seen_area_m2"]
     state = "watertight" if content["watertight"] else "NOT watertight, so its volume cannot be trusted"
-    closed_cm2 = _CM2_PER_M2 * (size["area_m2"] - seen_m2)
+    closed_cm2 = CM2_PER_M2 * (size["area_m2"] - seen_m2)
     note = f"The mesh is {state}. {closed_cm2:.1f} cm² of its area, mainly the base, were not seen but closed."
     if spread:
         note += f" ± is the standard deviation by {_listed(content['size_sd_by_cause'])}."
@@ -203,7 +203,7 @@ def _classifier_table(classifiers: Mapping[str, Any], regions: Mapping[str, Any]
             areas = [(label, area, sds.get(label)) for label, area in found["areas_m2"].items()]
             rest = rest_words(classifiers[name].get("limits", True))
             for label, area, sd in (*areas, (rest, found["outside_m2"], None)):
-                shown = f"{_CM2_PER_M2 * area:.2f}" if sd is None else _with_sd(_CM2_PER_M2 * area, _CM2_PER_M2 * sd)
+                shown = f"{CM2_PER_M2 * area:.2f}" if sd is None else _with_sd(CM2_PER_M2 * area, CM2_PER_M2 * sd)
                 rows.append([region, name, label, shown, f"{area / values['area_m2']:.1%}"])
     note = (
         "Area of the surface whose most probable class is each; ± is its standard deviation by the classifier's own "
@@ -252,7 +252,7 @@ def _reflectance_table(content: Mapping[str, Mapping[str, Any]]) -> TraitTable:
         )
     rows = []
     for name, value in regions.items():
-        row = [name, f"{_CM2_PER_M2 * content[name]['area_m2']:.2f}", _with_sd(value["mean"], value["std"])]
+        row = [name, f"{CM2_PER_M2 * content[name]['area_m2']:.2f}", _with_sd(value["mean"], value["std"])]
         if lit:
             row += [f"{value['measured']:.3f}", _with_sd(value["irradiance"], value["irradiance_std"])]
         rows.append(row)
@@ -265,13 +265,13 @@ def _class_tables(classes: Mapping[str, Any], seen_m2: float) -> list[TraitTable
     labels = [region["label"] for region in classes["regions"]]
     rows = [
         [
-            *(name, f"{_CM2_PER_M2 * area:.2f}", f"{area / seen_m2:.1%}", str(labels.count(name))),
-            *(f"{_CM2_PER_M2 * mixtures[name]:.2f}", f"{mixtures[name] / seen_m2:.1%}"),
+            *(name, f"{CM2_PER_M2 * area:.2f}", f"{area / seen_m2:.1%}", str(labels.count(name))),
+            *(f"{CM2_PER_M2 * mixtures[name]:.2f}", f"{mixtures[name] / seen_m2:.1%}"),
         ]
         for name, area in areas.items()
     ]
     listed = [
-        [region["label"], f"{_CM2_PER_M2 * region['area_m2']:.2f}", *(f"{1e3 * x:.1f}" for x in region["centre_m"])]
+        [region["label"], f"{CM2_PER_M2 * region['area_m2']:.2f}", *(f"{1e3 * x:.1f}" for x in region["centre_m"])]
         for region in classes["regions"][:_LISTED_REGIONS]
     ]
     note = (
@@ -288,7 +288,7 @@ def _class_tables(classes: Mapping[str, Any], seen_m2: float) -> list[TraitTable
     ]
 
 
-def write_page(path: Path, title: str, content: Mapping[str, Any], pictures: Mapping[str, str]) -> None:
+def write_traits_page(path: Path, title: str, content: Mapping[str, Any], pictures: Mapping[str, str]) -> None:
     """Write ``traits.md``: the tables of ``content``, and pictures (file names by caption)."""
     parts = [f"# Traits of {markdown_text(title)}"]
     for table in trait_tables(content):

@@ -89,7 +89,7 @@ def feret_diameters(outline: Float[np.ndarray, "n 2"]) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
-class SharedErrors:
+class SystematicErrors:
     """Standard deviations of what the points of a cloud have in common.
 
     Attributes:
@@ -109,14 +109,14 @@ def size_uncertainty(
     mesh: Mesh,
     config: MeshConfig,
     splits: int,
-    shared: SharedErrors | None = None,
+    systematic: SystematicErrors | None = None,
     done: Callable[[int], None] | None = None,
 ) -> dict[str, Size]:
     """Standard deviation of each size by its cause; the causes are independent.
 
     points: random halves of the cloud are meshed (half-samples, McCarthy 1969). base: the unseen base is closed
     straight down instead of along the surface's slope, and at another height. detail: smoothing by twice the radius.
-    scale and surface: of ``shared``; without it they are left out.
+    scale and surface: of ``systematic``; without it they are left out.
 
     Args:
         points_m: the cloud.
@@ -124,7 +124,7 @@ def size_uncertainty(
         mesh: its `closed_mesh`.
         config: settings of the mesh.
         splits: pairs of halves.
-        shared: what the points have in common, if it is known.
+        systematic: what the points have in common, if it is known.
         done: called with the number of finished sizes, of `sizes_to_find`.
 
     Example:
@@ -155,19 +155,19 @@ def size_uncertainty(
     parts["base"] = np.abs(FOOT * (size(closed(*surface[:2], straight, config)) - usual))
     coarser = replace(config, smoothing_radius_m=COARSER * config.smoothing_radius_m)
     parts["detail"] = np.abs(size(closed(*surface_and_base(points_m, normals, coarser), coarser)) - usual)
-    if shared is not None:
-        if shared.base_m > 0.0:
-            lower = replace(surface[2], height_m=surface[2].height_m - shared.base_m)
+    if systematic is not None:
+        if systematic.base_m > 0.0:
+            lower = replace(surface[2], height_m=surface[2].height_m - systematic.base_m)
             parts["base"] = np.hypot(parts["base"], size(closed(*surface[:2], lower, config)) - usual)
         whole = size_of(mesh)
-        parts["scale"] = shared.scale * np.array(astuple(whole)) * DIMENSIONS
-        parts["surface"] = np.abs(size(offset(mesh, shared.surface_m)) - np.array(astuple(whole)))
+        parts["scale"] = systematic.scale * np.array(astuple(whole)) * DIMENSIONS
+        parts["surface"] = np.abs(size(offset(mesh, systematic.surface_m)) - np.array(astuple(whole)))
     return {cause: Size(*values.tolist()) for cause, values in parts.items()}
 
 
-def sizes_to_find(splits: int, shared: SharedErrors | None) -> int:
+def sizes_to_find(splits: int, systematic: SystematicErrors | None) -> int:
     """How many sizes `size_uncertainty` measures."""
-    return 2 * splits + 3 + (0 if shared is None else 1 + (shared.base_m > 0.0))
+    return 2 * splits + 3 + (0 if systematic is None else 1 + (systematic.base_m > 0.0))
 
 
 def combined(parts: Mapping[str, Size]) -> Size:
@@ -175,7 +175,7 @@ def combined(parts: Mapping[str, Size]) -> Size:
     return Size(*np.sqrt(np.square([astuple(size) for size in parts.values()]).sum(axis=0)).tolist())
 
 
-def shared_errors(dataset: PackedDataset, *, base_known: bool) -> SharedErrors:
+def systematic_errors(dataset: PackedDataset, *, base_known: bool) -> SystematicErrors:
     """What the points of a cloud of this dataset have in common: scale by its poses, the rest by its pixels.
 
     Args:
@@ -186,7 +186,7 @@ def shared_errors(dataset: PackedDataset, *, base_known: bool) -> SharedErrors:
         InputError: ``poses.json`` cannot be read.
     """
     pixel_m = pixel_on_object_m(dataset)
-    return SharedErrors(
+    return SystematicErrors(
         scale=scale_uncertainty(dataset.root / "poses.json"),
         surface_m=SURFACE_PX * pixel_m,
         base_m=0.0 if base_known else UNKNOWN_BASE_PX * pixel_m,

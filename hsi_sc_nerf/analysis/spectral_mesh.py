@@ -126,7 +126,7 @@ def _neighbours(
     return neighbours, weights / weights.sum(axis=1, keepdims=True), distance_m[:, 0] <= seen_within_m
 
 
-def write_mesh(path: Path, surface: SpectralMesh, extra: dict[str, Float[np.ndarray, "v"]]) -> None:
+def write_spectral_mesh(path: Path, surface: SpectralMesh, extra: dict[str, Float[np.ndarray, "v"]]) -> None:
     """Write a spectral PLY whose points are the vertices, with triangles.
 
     Columns beside the bands: ``seen`` (1 where spectra were measured, 0 on the closed base), those in ``extra``, and,

@@ -224,7 +224,7 @@ def analyse(
 
 def region_spectrum(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"]) -> MeanAndSd:
     """Mean and standard deviation of the chosen vertices' spectra, weighted by their area."""
-    return mean_and_sd(surface.spectra[chosen], surface.areas_m2[chosen])
+    return weighted_mean_and_sd(surface.spectra[chosen], surface.areas_m2[chosen])
 
 
 def _reflectance_std(
@@ -267,7 +267,8 @@ def _map_mean(
     """The mean of a map over the chosen vertices; its noise is that of the region's mean spectrum."""
     values, areas_m2 = one.values[chosen], surface.areas_m2[chosen]
     std = math.hypot(propagated_std(one.of, spectrum.mean, noise), one.error)
-    return MapMean(mean_and_sd(values, areas_m2), std, float(areas_m2[np.isnan(values)].sum() / areas_m2.sum()))
+    undefined = float(areas_m2[np.isnan(values)].sum() / areas_m2.sum())
+    return MapMean(weighted_mean_and_sd(values, areas_m2), std, undefined)
 
 
 def _mixed(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"], pixel_m: float) -> float:
@@ -286,13 +287,13 @@ def _light(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"]) -> RegionLight 
         return None
     areas_m2, lit = surface.areas_m2[chosen], surface.lit
     return RegionLight(
-        mean_and_sd(lit.measured[chosen], areas_m2),
-        mean_and_sd(lit.irradiance[chosen], areas_m2),
+        weighted_mean_and_sd(lit.measured[chosen], areas_m2),
+        weighted_mean_and_sd(lit.irradiance[chosen], areas_m2),
         float((areas_m2 @ lit.irradiance_std[chosen]) / areas_m2.sum()),
     )
 
 
-def mean_and_sd(values: Float[np.ndarray, "n *rest"], weights: Float[np.ndarray, "n"]) -> MeanAndSd:
+def weighted_mean_and_sd(values: Float[np.ndarray, "n *rest"], weights: Float[np.ndarray, "n"]) -> MeanAndSd:
     """Weighted mean and standard deviation over the first axis.
 
     Values that are not finite do not count; both are NaN where no value counts.

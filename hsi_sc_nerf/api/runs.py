@@ -219,4 +219,4 @@ def open_run(folder: Path | str) -> Run:
         below = sorted(folder.rglob("config.yml"))
         give = below[-1].parent if below else "the folder of a trained run"
         raise InputError(f"{folder}: holds no config.yml; give {give}.")
-    return Run(trained_run.open_run(found[0]), run_name(found[0]))
+    return Run(trained_run.open_trained_run(found[0]), run_name(found[0]))

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from hsi_sc_nerf.analysis.report import SIZES, each_object
+from hsi_sc_nerf.analysis.report import CM2_PER_M2, MM_PER_M, SIZES, each_object
 from hsi_sc_nerf.analysis.traits import WHOLE
 from hsi_sc_nerf.batch import columns
 from hsi_sc_nerf.batch.columns import Column, Value
@@ -22,16 +22,9 @@ from hsi_sc_nerf.processing.session_checks import CHECKS_PATH
 
 _AGAIN = "delete it and start the batch again"
 _LEVELS = ("green", "amber", "red")
-_CM2_PER_M2, _MM_PER_M = 1e4, 1e3
 Cells = dict[Column, Value]
 Tells = Callable[[Mapping[str, Any]], Iterator[tuple[Column, Value]]]
 """What is to be read from the content of a file."""
-
-
-class _Trouble(NamedTuple):
-    status: str
-    step: str
-    sentence: str
 
 
 @dataclass(frozen=True)
@@ -131,7 +124,7 @@ def _traits(content: Mapping[str, Any]) -> Iterator[tuple[Column, Value]]:
     if "piece" in content:
         yield columns.PIECE, _number(content["piece"])
         for column, at in zip(columns.PIECE_AT, content["centre_m"], strict=False):
-            yield column, _number(at, _MM_PER_M)
+            yield column, _number(at, MM_PER_M)
     closed = bool(content["watertight"])
     for key, (_, _, factor) in SIZES.items():
         value, sd = columns.SIZE[key]
@@ -139,7 +132,7 @@ def _traits(content: Mapping[str, Any]) -> Iterator[tuple[Column, Value]]:
             yield value, _number(content["size"][key], factor)
             yield sd, _number((content["size_sd"] or {}).get(key), factor)
     yield columns.WATERTIGHT, closed
-    yield columns.SEEN_AREA, _number(content["seen_area_m2"], _CM2_PER_M2)
+    yield columns.SEEN_AREA, _number(content["seen_area_m2"], CM2_PER_M2)
     regions: Mapping[str, Any] = content["regions"]
     for key, value in regions[WHOLE]["reflectance"].items():
         if key in columns.REFLECTANCE:
@@ -152,14 +145,14 @@ def _traits(content: Mapping[str, Any]) -> Iterator[tuple[Column, Value]]:
     for name, found in regions[WHOLE].get("classifiers", {}).items():
         for label, area_m2 in found["areas_m2"].items():
             area, sd = columns.classifier_columns(name, label)
-            yield area, _number(area_m2, _CM2_PER_M2)
-            yield sd, _number(found["area_sds_m2"].get(label), _CM2_PER_M2)
+            yield area, _number(area_m2, CM2_PER_M2)
+            yield sd, _number(found["area_sds_m2"].get(label), CM2_PER_M2)
     if content["classes"]:
         yield from _classes(content["classes"], float(content["seen_area_m2"]))
     for name, region in regions.items():
         if name != WHOLE:
             area, *reflectance = columns.region_columns(name)
-            yield area, _number(region["area_m2"], _CM2_PER_M2)
+            yield area, _number(region["area_m2"], CM2_PER_M2)
             yield from zip(reflectance, (_number(region["reflectance"][key]) for key in ("mean", "std")), strict=True)
             for index, found in region["indices"].items():
                 yield columns.region_index_column(name, index), _number(found["mean"])
@@ -170,7 +163,7 @@ def _classes(classes: Mapping[str, Any], seen_m2: float) -> Iterator[tuple[Colum
     mixtures_m2 = {**classes["mixture_areas_m2"], "in no class": classes["mixture_unclassified_m2"]}
     for name, area_m2 in areas_m2.items():
         area, fraction, mixture = columns.class_columns(name)
-        yield area, _number(area_m2, _CM2_PER_M2)
+        yield area, _number(area_m2, CM2_PER_M2)
         yield fraction, _number(area_m2, 1.0 / seen_m2)
         yield mixture, _number(mixtures_m2[name], 1.0 / seen_m2)
 
@@ -199,3 +192,9 @@ def _number(value: Any, factor: float = 1.0) -> float | None:
         raise TypeError(f"{shown(value)} is no number")
     scaled = factor * float(value)
     return scaled if math.isfinite(scaled) else None
+
+
+class _Trouble(NamedTuple):
+    status: str
+    step: str
+    sentence: str

@@ -18,7 +18,7 @@ from hsi_sc_nerf.batch import columns
 from hsi_sc_nerf.batch.columns import Column
 from hsi_sc_nerf.batch.plan import OBJECTS_NAME
 from hsi_sc_nerf.batch.session_list import OBJECT, SESSION, SETTINGS
-from hsi_sc_nerf.batch.tables import Table
+from hsi_sc_nerf.batch.tables import BatchTable
 from hsi_sc_nerf.files import atomic_write, read_picture
 from hsi_sc_nerf.inspection.inspect import THUMBNAIL_GAMMA
 from hsi_sc_nerf.report.page import data_address, own_text, page_template
@@ -43,7 +43,7 @@ _SPECIAL = {
 }
 
 
-def write_overview(table: Table, out: Path, done: Callable[[int], None] | None = None) -> Path:
+def write_overview(table: BatchTable, out: Path, done: Callable[[int], None] | None = None) -> Path:
     """Write the page, completely or not at all.
 
     Args:
@@ -91,7 +91,7 @@ def thumbnail(data: Path) -> str:
     return ""
 
 
-def _key_figures(table: Table) -> dict[str, str]:
+def _key_figures(table: BatchTable) -> dict[str, str]:
     statuses, seconds = _values(table, columns.STATUS), _values(table, columns.TOTAL)
     figures = {state: str(statuses.count(state)) for state in ("done", "failed", "damaged", "unfinished")}
     figures = {state: count for state, count in figures.items() if count != "0" or state in ("done", "failed")}
@@ -102,11 +102,11 @@ def _key_figures(table: Table) -> dict[str, str]:
     return figures
 
 
-def _values(table: Table, standing: Column) -> list[columns.Value]:
+def _values(table: BatchTable, standing: Column) -> list[columns.Value]:
     return table.values(table.columns[_place(table, standing)])
 
 
-def _place(table: Table, standing: Column) -> int:
+def _place(table: BatchTable, standing: Column) -> int:
     """Where a standing column is, whatever name it had to take."""
     return next(
         at for at, column in enumerate(table.columns) if column.group != "list" and _bare(column) == _bare(standing)
@@ -117,7 +117,7 @@ def _bare(column: Column) -> Column:
     return replace(column, name="", spread=None)
 
 
-def _payload(table: Table, out: Path, done: Callable[[int], None] | None) -> dict[str, Any]:
+def _payload(table: BatchTable, out: Path, done: Callable[[int], None] | None) -> dict[str, Any]:
     """What the scripts need: columns, rows, and of each row the picture and the address of its report."""
     shown = {_bare(column) for column in _SHOWN}
     described = [

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from hsi_sc_nerf.errors import InputError, shown
+from hsi_sc_nerf.number_table import without_empty_columns
 
 OBJECT, SESSION = "object", "session"
 SETTINGS = ("preset", "process", "train")
@@ -103,11 +104,12 @@ def _read_table(path: Path) -> Iterator[tuple[int, Row]]:
     first = text.partition("\n")[0]
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=max(",;\t", key=first.count), strict=True)
     try:
-        lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
+        lines = [(reader.line_num, stripped) for cells in reader if any(stripped := [cell.strip() for cell in cells])]
     except csv.Error as error:
         raise InputError(f"{path}: is no table after line {reader.line_num} ({error}); save it as CSV.") from error
-    lines = _without_empty_columns([line for line in lines if any(line[1])])
-    titles = [_own_title(title) for title in lines[0][1]] if lines else []
+    kept = without_empty_columns([cells for _, cells in lines])
+    titles = [_own_title(title) for title in kept[0]] if kept else []
+    rows = [(line, cells) for (line, _), cells in zip(lines[1:], kept[1:], strict=True)]
     for title in (OBJECT, SESSION):
         if title not in titles:
             raise InputError(
@@ -116,30 +118,24 @@ def _read_table(path: Path) -> Iterator[tuple[int, Row]]:
             )
     if "" in titles or len(set(titles)) < len(titles):
         raise InputError(f"{path}: a column has no title, or two have the same; give each a title of its own.")
-    for line, cells in lines[1:]:
+    for line, cells in rows:
         if len(cells) != len(titles):
             mend = "put quotation marks around a cell that holds the separator"
             mend = mend if len(cells) > len(titles) else "add the cells that are missing, which may be empty"
             raise InputError(f"{path}, line {line}: has {len(cells)} cells and not {len(titles)}; {mend}.")
-    columns: list[Sequence[str]] = list(zip(*(cells for _, cells in lines[1:]), strict=True))
+    columns: list[Sequence[str]] = list(zip(*(cells for _, cells in rows), strict=True))
     if reader.dialect.delimiter != ",":
         columns = [
             column if title in (OBJECT, SESSION, *SETTINGS) else _with_points(column)
             for title, column in zip(titles, columns, strict=False)
         ]
-    for (line, _), row in zip(lines[1:], zip(*columns, strict=True), strict=True):
+    for (line, _), row in zip(rows, zip(*columns, strict=True), strict=True):
         yield line, dict(zip(titles, row, strict=True))
 
 
 def _own_title(title: str) -> str:
     """A title that means something here in lower case; one of the user's as it is."""
     return title.lower() if title.lower() in (OBJECT, SESSION, *SETTINGS) else title
-
-
-def _without_empty_columns(lines: Sequence[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
-    """The lines without the empty cells that a spreadsheet leaves at the right of all."""
-    width = max((at + 1 for _, cells in lines for at, cell in enumerate(cells) if cell), default=0)
-    return [(line, cells[:width]) for line, cells in lines]
 
 
 def _with_points(column: Sequence[str]) -> Sequence[str]:

@@ -22,7 +22,7 @@ _NUMBER = re.compile(r"[+-]?(0|[1-9]\d{0,14})(\.\d*)?([eE][+-]?\d{1,2})?")
 
 
 @dataclass(frozen=True)
-class Table:
+class BatchTable:
     """One row an object.
 
     Attributes:
@@ -44,7 +44,7 @@ class Table:
         return [None if value is None or value == "" else float(value) for value in values]
 
 
-def read_table(out: Path, done: Callable[[int], None] | None = None) -> Table:
+def read_table(out: Path, done: Callable[[int], None] | None = None) -> BatchTable:
     """The table of the batch in ``out``.
 
     Args:
@@ -72,7 +72,7 @@ def read_table(out: Path, done: Callable[[int], None] | None = None) -> Table:
         numbers = name not in _MEANINGS and any(values) and all(not v or _NUMBER.fullmatch(v) for v in values)
         given.append(Column(name, "", meaning, "list", "number" if numbers else "text"))
     rows = [[*session.values(), *(row.cells.get(column) for column in names)] for session, row in found]
-    return Table((*given, *names.values()), rows, [row.report for _, row in found])
+    return BatchTable((*given, *names.values()), rows, [row.report for _, row in found])
 
 
 def listed_sessions(out: Path) -> list[Row]:
@@ -111,7 +111,7 @@ def named_apart(taken: Iterable[str], found: Iterable[Column]) -> dict[Column, C
     return {column: renamed(column) for column in names}
 
 
-def write_tables(table: Table, out: Path) -> bool:
+def write_tables(table: BatchTable, out: Path) -> bool:
     """Write the table as CSV and Parquet, and the dictionary of its columns.
 
     Returns:

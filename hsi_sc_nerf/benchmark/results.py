@@ -83,7 +83,9 @@ def write_csv(path: Path, runs: Sequence[BenchmarkRun]) -> None:
         writer.writerows(lines)
 
 
-def write_page(path: Path, runs: Sequence[BenchmarkRun], settings: dict[str, Any], machine: dict[str, str]) -> None:
+def write_results_page(
+    path: Path, runs: Sequence[BenchmarkRun], settings: dict[str, Any], machine: dict[str, str]
+) -> None:
     """The table as Markdown, with what it was measured on and how.
 
     Raises:

@@ -223,5 +223,5 @@ def _write(runs: Sequence[BenchmarkRun], command: BenchmarkCommand, machine: dic
     write_json(
         out.with_suffix(".json"), {"machine": machine, "settings": settings, "runs": [asdict(run) for run in runs]}
     )
-    results.write_page(out.with_suffix(".md"), runs, settings, machine)
+    results.write_results_page(out.with_suffix(".md"), runs, settings, machine)
     results.draw_accuracy_and_time(out.with_suffix(".png"), runs, command.clock)

@@ -136,7 +136,7 @@ class ChangeCommand:
             change_report.write_change_ply(self.output_dir / "change.ply", days[0], comparisons)
             settings = {"band_nm": list(self.band_nm), "session_std": self.session_std, **asdict(self.mesh)}
             settings |= {"max_incidence_deg": self.max_incidence_deg}
-            change_report.write_tables(self.output_dir, comparisons, settings, pictures, repeat)
+            change_report.write_change_tables(self.output_dir, comparisons, settings, pictures, repeat)
         page = escape(str(self.output_dir / "change.md"))
         console.print(f"Changes, with pictures: {page}", soft_wrap=True)
 
@@ -182,10 +182,10 @@ def _read(path: Path) -> SpectralCloud:
     # Slow to import.
     from hsi_sc_nerf.export.options import CloudOptions
     from hsi_sc_nerf.export.spectral_export import export_cloud
-    from hsi_sc_nerf.models.trained_run import open_run
+    from hsi_sc_nerf.models.trained_run import open_trained_run
 
     with tempfile.TemporaryDirectory() as folder:
-        return read_spectral_ply(export_cloud(open_run(path), Path(folder), CloudOptions(num_points=POINTS)))
+        return read_spectral_ply(export_cloud(open_trained_run(path), Path(folder), CloudOptions(num_points=POINTS)))
 
 
 def _day_names(paths: Sequence[Path]) -> list[str]:

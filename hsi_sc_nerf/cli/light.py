@@ -61,7 +61,7 @@ class MaterialCommand:
         from hsi_sc_nerf.export.formats import format_of, require_format, write_cloud
         from hsi_sc_nerf.files import require_writable, write_json
         from hsi_sc_nerf.light.of_run import light_of_run
-        from hsi_sc_nerf.models.trained_run import open_run
+        from hsi_sc_nerf.models.trained_run import open_trained_run
 
         output = self.output or self.cloud.with_name(f"{self.cloud.stem}-material.ply")
         require_writable(output.parent)
@@ -69,12 +69,12 @@ class MaterialCommand:
         cloud = read_spectral_ply(self.cloud)
         extra = {*cloud.extra, *LIGHT_COLUMNS, *band_property_names(cloud.wavelengths_nm, "material")}
         require_format(stem, file_format, len(cloud.wavelengths_nm), len(extra))
-        run = open_run(self.load_config)
+        run = open_trained_run(self.load_config)
         require_bands_of_run(cloud, run.model.wavelengths_nm, str(self.cloud))
         found = light_of_run(run, self._white_normal())
         corrected = self.correct == "always" or (self.correct == "auto" and found.evidence.shaded)
         result = with_material(cloud, found, run.model.wavelengths_nm, corrected=corrected)
-        told = summary(found, result, corrected=corrected)
+        told = light_summary(found, result, corrected=corrected)
         write_cloud(stem, stream(result), file_format)
         write_json(output.with_suffix(".json"), told)
         console = Console(soft_wrap=True, highlight=False)
@@ -88,7 +88,7 @@ class MaterialCommand:
 
 
 def sentences(told: dict[str, Any]) -> list[str]:
-    """What a `summary` says of the light, in words; what warns begins with that word."""
+    """What a `light_summary` says of the light, in words; what warns begins with that word."""
     evidence, std = told["evidence"], told["relative_std"]
     decided = "the material's columns are corrected" if told["corrected"] else "nothing is corrected"
     lines = [
@@ -105,7 +105,7 @@ def sentences(told: dict[str, Any]) -> list[str]:
     return lines
 
 
-def summary(found: RunLight, cloud: SpectralCloud, *, corrected: bool) -> dict[str, Any]:
+def light_summary(found: RunLight, cloud: SpectralCloud, *, corrected: bool) -> dict[str, Any]:
     """The light, what tells of it, and its median uncertainty in a cloud `with_material`, ready for JSON."""
     light, (irradiance, std) = found.light.fit.light, (cloud.extra[name] for name in LIGHT_COLUMNS)
     return {

@@ -6,7 +6,7 @@ import math
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -17,6 +17,9 @@ from hsi_sc_nerf.export.options import CloudOptions
 from hsi_sc_nerf.files import require_writable
 from hsi_sc_nerf.packed.of_run import require_dataset_of_run
 from hsi_sc_nerf.settings_file import between, check_options
+
+if TYPE_CHECKING:
+    from hsi_sc_nerf.models.trained_run import TrainedRun
 
 _METRES = {"m": 1.0, "mm": 1e-3}
 
@@ -48,9 +51,9 @@ class ExportCommand:
         require_dataset_of_run(self.load_config)
         from hsi_sc_nerf.export.cloud import run_name
         from hsi_sc_nerf.export.spectral_export import export_cloud
-        from hsi_sc_nerf.models.trained_run import open_run
+        from hsi_sc_nerf.models.trained_run import open_trained_run
 
-        export_cloud(open_run(self.load_config), self.output_dir, self.options, run_name(self.load_config))
+        export_cloud(open_trained_run(self.load_config), self.output_dir, self.options, run_name(self.load_config))
 
 
 @dataclass(frozen=True)
@@ -78,8 +81,11 @@ class SampleCommand:
     """The run's cloud by `hsi-sc-nerf material`: points also get the material's reflectance (material_397.32nm, ...),
     irradiance and irradiance_std. Points further than 3 mm from the cloud have NaN there."""
 
-    def main(self) -> None:
+    def main(self, run: TrainedRun | None = None) -> None:
         """Run the command.
+
+        Args:
+            run: that of ``load_config``, where it is open already.
 
         Raises:
             InputError: the points or the run cannot be used, no point lies on the object, or the result cannot be
@@ -90,13 +96,14 @@ class SampleCommand:
         from hsi_sc_nerf.export.cloud import run_name
         from hsi_sc_nerf.export.cloud_material import read_material
         from hsi_sc_nerf.export.sample_points import read_points, sample_points, write_sampled_ply
-        from hsi_sc_nerf.models.trained_run import open_run
+        from hsi_sc_nerf.models.trained_run import open_trained_run
 
         output = self.output or self.points.with_name(f"{self.points.stem}-spectral.ply")
         require_writable(output.parent)
         given = read_points(self.points)
         normals = given.normals()
-        run = open_run(self.load_config)
+        if run is None:
+            run = open_trained_run(self.load_config)
         wavelengths_nm = run.dataset.wavelengths_nm
         material = None if self.material is None else read_material(self.material, wavelengths_nm)
         points_m = given.positions * _METRES[self.unit]
@@ -153,8 +160,11 @@ class RenderCommand:
     """The run's cloud by `hsi-sc-nerf material`: NAME_material is a cube of the material's reflectance beside each
     cube. It has no data where a pixel shows nothing within 3 mm of the cloud."""
 
-    def main(self) -> None:
+    def main(self, run: TrainedRun | None = None) -> None:
         """Run the command.
+
+        Args:
+            run: that of ``load_config``, where it is open already.
 
         Raises:
             InputError: the run, a camera path or a name cannot be used, or a result cannot be written.
@@ -166,8 +176,8 @@ class RenderCommand:
         require_dataset_of_run(self.load_config)
         from hsi_sc_nerf.export.cloud_material import read_material
         from hsi_sc_nerf.files import atomic_write
-        from hsi_sc_nerf.models.trained_run import open_run
-        from hsi_sc_nerf.rendering.pictures import compare, find_false_colour, open_video, write_report
+        from hsi_sc_nerf.models.trained_run import open_trained_run
+        from hsi_sc_nerf.rendering.pictures import compare_view, find_false_colour, open_video, write_render_report
         from hsi_sc_nerf.rendering.views import (
             render_view,
             views_of_frames,
@@ -180,7 +190,8 @@ class RenderCommand:
         from hsi_sc_nerf.spectra import to_8_bit
         from hsi_sc_nerf.terminal import progress_bar
 
-        run = open_run(self.load_config)
+        if run is None:
+            run = open_trained_run(self.load_config)
         material = None if self.material is None else read_material(self.material, run.dataset.wavelengths_nm)
         found = [find_false_colour(name, run.dataset.wavelengths_nm) for name in self.video]
         shown = list({item.name: item for item in found}.values())  # a name may be given twice
@@ -207,12 +218,14 @@ class RenderCommand:
                         write_cube_of_view(self.output_dir, f"{name}_material", spectra, run.dataset, self.cubes)
                     rows.append({"view": name, "valid": float(rendered.valid.float().mean())})
                     if views.measured is not None:
-                        rows[-1] |= compare(self.output_dir, name, rendered, views.measured[i], run.model.rgb_bands)
+                        rows[-1] |= compare_view(
+                            self.output_dir, name, rendered, views.measured[i], run.model.rgb_bands
+                        )
                     for item, add_frame in zip(shown, videos, strict=True):
                         add_frame(to_8_bit(item.colours(rendered).numpy()))
                     update(i + 1)
         legends = {path.name: item.legend for path, item in zip(files, shown, strict=True)}
-        write_report(self.output_dir / "render", rows, legends)
+        write_render_report(self.output_dir / "render", rows, legends)
         Console().print(f"{len(views.names)} views: {escape(str(self.output_dir / 'render.md'))}")
 
 

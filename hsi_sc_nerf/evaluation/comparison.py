@@ -162,6 +162,10 @@ def read_reference(path: Path, config: CompareConfig) -> Reference:
 
     Raises:
         InputError: the file cannot be used.
+
+    Example:
+        >>> len(read_reference(Path("point_cloud.ply"), CompareConfig()).surface.points_m)
+        30
     """
     return Reference(str(path), surface_of(path, config, METRES[config.reference_unit]))
 

@@ -42,7 +42,7 @@ def comparison_tables(figures: Mapping[str, Any]) -> tuple[TextTable, TextTable]
     """Precision, recall and F-score at the chosen threshold and at the knee; statistics of the distances both ways.
 
     Args:
-        figures: of `summary`, or the content of ``comparison.json``.
+        figures: of `comparison_summary`, or the content of ``comparison.json``.
 
     Raises:
         KeyError, TypeError, ValueError: it is no such content.
@@ -60,7 +60,7 @@ def comparison_tables(figures: Mapping[str, Any]) -> tuple[TextTable, TextTable]
     return (_SCORE_TITLES, scores), (["distance, mm", *_STATISTICS.values()], distances)
 
 
-def summary(comparison: Comparison) -> dict[str, Any]:
+def comparison_summary(comparison: Comparison) -> dict[str, Any]:
     """All figures in metres and percent, for JSON."""
     forth, back = comparison.to_reference_m, comparison.to_cloud_m
     curves = {key: values.tolist() for key, values in asdict(comparison.curves).items()}
@@ -106,14 +106,14 @@ def write_comparison(folder: Path, comparison: Comparison, cloud_name: str, refe
     """``comparison.md``, ``comparison.json``, ``curves.png``, ``distances.png`` and ``distances.ply``, all or none.
 
     Returns:
-        The figures, as `summary` gives them.
+        The figures, as `comparison_summary` gives them.
 
     Raises:
         InputError: the operating system refused to write.
     """
     names = ("comparison.md", "comparison.json", "curves.png", "distances.png", "distances.ply")
     limit_m = _colour_limit_m(comparison.to_reference_m, comparison.to_cloud_m)
-    figures = summary(comparison)
+    figures = comparison_summary(comparison)
     with atomic_write(*(folder / name for name in names)) as (page, numbers, curves, pictures, cloud):
         write_json(numbers, {"cloud": cloud_name, "reference": reference_name, **figures})
         knee, chosen = (

@@ -78,7 +78,7 @@ def sample_points(
         max_views: number of training cameras to average over, at most.
 
     Example:
-        >>> run, points = open_run(Path("config.yml")), read_points(Path("scan.ply"))
+        >>> run, points = open_trained_run(Path("config.yml")), read_points(Path("scan.ply"))
         >>> found = sample_points(run, points.positions, points.normals(), max_distance_m=0.003, max_views=4)
         >>> found.spectra.shape
         (80000, 204)

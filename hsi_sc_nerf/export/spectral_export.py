@@ -58,7 +58,7 @@ def export_cloud(run: TrainedRun, output_dir: Path, options: CloudOptions, name:
         InputError: the model holds no object, the options contradict the run, or the file cannot be written.
 
     Example:
-        >>> run = open_run(Path("outputs/pear/hsi-sc-nerf/2026-11-22_101500/config.yml"))
+        >>> run = open_trained_run(Path("outputs/pear/hsi-sc-nerf/2026-11-22_101500/config.yml"))
         >>> export_cloud(run, Path("export"), CloudOptions(num_points=100_000))
         PosixPath('export/point_cloud.ply')
     """

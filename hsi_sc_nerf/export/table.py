@@ -67,6 +67,11 @@ def from_xarray(table: xarray.Dataset) -> SpectralCloud:
 
     Raises:
         InputError: a variable of a cloud is missing, or has other dimensions.
+
+    Example:
+        >>> table = to_xarray(read_spectral_ply("point_cloud.ply"))
+        >>> len(from_xarray(table.isel(point=slice(10))))
+        10
     """
     needed = ("reflectance", "wavelength", *"xyz", *_NORMALS, *_COLOURS)
     missing = [name for name in needed if name not in table.variables]

@@ -106,8 +106,8 @@ class _Interpolate(torch.autograd.Function):
         grad_positions = grad_table = None
         if ctx.needs_input_grad[0]:
             along = torch.einsum("if,icf->ic", grad, F.embedding(indices, table))
-            slopes = _slopes(along, fraction).view(-1, scalings.shape[0], 3)
-            grad_positions = torch.einsum("nla,l->na", slopes, scalings)
+            gradients = _corner_gradients(along, fraction).view(-1, scalings.shape[0], 3)
+            grad_positions = torch.einsum("nla,l->na", gradients, scalings)
         if ctx.needs_input_grad[1]:
             grad_table = _scatter_to_table(grad, indices, _corner_weights(fraction), table.shape[0])
         return grad_positions, grad_table, None, None
@@ -147,7 +147,7 @@ def _corner_weights(fraction: Float[Tensor, "n 3"]) -> Float[Tensor, "n 8"]:
     )
 
 
-def _slopes(values: Float[Tensor, "n 8"], fraction: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+def _corner_gradients(values: Float[Tensor, "n 8"], fraction: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     """Gradient of the trilinear interpolation of corner values with respect to the fraction."""
     x, y, z = fraction.unbind(dim=-1)
     near_z, step_z = values[:, 0::2], values[:, 1::2] - values[:, 0::2]  # (n, 4): corners 2 x + y

@@ -30,6 +30,63 @@ numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # type: ign
 _one_at_a_time = Lock()
 
 
+def run_in_parts(alone: Callable[..., None], at_once: Callable[..., None], points: int, *arguments: Any) -> None:
+    """Run a kernel in as many parts as torch has threads, or as one where waking them is not worth it.
+
+    Args:
+        alone: takes the arguments, the number of a part and how many parts there are.
+        at_once: takes the arguments and the number of parts, and does them side by side.
+    """
+    threads = min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+    if threads == 1 or points < _SHARED_FROM:
+        alone(*arguments, 0, 1)
+        return
+    with _one_at_a_time:
+        numba.set_num_threads(threads)
+        at_once(*arguments, threads)
+
+
+def interpolate(
+    positions: Float32[np.ndarray, "n 3"],
+    table: Float32[np.ndarray, "rows channels"],
+    scalings: Float32[np.ndarray, "levels"],
+    table_size: int,
+) -> Float32[np.ndarray, "n levels_x_channels"]:
+    """Trilinear interpolation of a stack of hashed grids, as `hash_grid.interpolate_hash_grid` describes it."""
+    features = np.empty((len(positions), len(scalings) * table.shape[1]), np.float32)
+    arguments = positions, table, scalings, table_size - 1, features
+    run_in_parts(_interpolate, _interpolate_at_once, len(positions), *arguments)
+    return features
+
+
+def table_gradient(
+    positions: Float32[np.ndarray, "n 3"],
+    table: Float32[np.ndarray, "rows channels"],
+    scalings: Float32[np.ndarray, "levels"],
+    table_size: int,
+    gradient: Float32[np.ndarray, "n levels_x_channels"],
+) -> Float32[np.ndarray, "rows channels"]:
+    """Gradient with respect to the table; threads share the levels, whose rows are apart."""
+    grad_table = np.zeros_like(table)
+    arguments = positions, scalings, table_size - 1, gradient, grad_table
+    run_in_parts(_add_to_table, _add_to_table_at_once, len(positions), *arguments)
+    return grad_table
+
+
+def position_gradient(
+    positions: Float32[np.ndarray, "n 3"],
+    table: Float32[np.ndarray, "rows channels"],
+    scalings: Float32[np.ndarray, "levels"],
+    table_size: int,
+    gradient: Float32[np.ndarray, "n levels_x_channels"],
+) -> Float32[np.ndarray, "n 3"]:
+    """Gradient with respect to the positions."""
+    grad_positions = np.zeros_like(positions)
+    arguments = positions, table, scalings, table_size - 1, gradient, grad_positions
+    run_in_parts(_position_gradients, _position_gradients_at_once, len(positions), *arguments)
+    return grad_positions
+
+
 @compiled
 def _corners(x, y, z, scale, mask, offset):
     """Rows of a cell's eight corners, numbered 4 x + 2 y + z, and where in the cell the point lies."""
@@ -135,60 +192,3 @@ def _add_to_table_at_once(positions, scalings, mask, gradient, grad_table, parts
 def _position_gradients_at_once(positions, table, scalings, mask, gradient, grad_positions, parts):
     for part in numba.prange(parts):
         _position_gradients(positions, table, scalings, mask, gradient, grad_positions, part, parts)
-
-
-def run_in_parts(alone: Callable[..., None], at_once: Callable[..., None], points: int, *arguments: Any) -> None:
-    """Run a kernel in as many parts as torch has threads, or as one where waking them is not worth it.
-
-    Args:
-        alone: takes the arguments, the number of a part and how many parts there are.
-        at_once: takes the arguments and the number of parts, and does them side by side.
-    """
-    threads = min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
-    if threads == 1 or points < _SHARED_FROM:
-        alone(*arguments, 0, 1)
-        return
-    with _one_at_a_time:
-        numba.set_num_threads(threads)
-        at_once(*arguments, threads)
-
-
-def interpolate(
-    positions: Float32[np.ndarray, "n 3"],
-    table: Float32[np.ndarray, "rows channels"],
-    scalings: Float32[np.ndarray, "levels"],
-    table_size: int,
-) -> Float32[np.ndarray, "n levels_x_channels"]:
-    """Trilinear interpolation of a stack of hashed grids, as `hash_grid.interpolate_hash_grid` describes it."""
-    features = np.empty((len(positions), len(scalings) * table.shape[1]), np.float32)
-    arguments = positions, table, scalings, table_size - 1, features
-    run_in_parts(_interpolate, _interpolate_at_once, len(positions), *arguments)
-    return features
-
-
-def table_gradient(
-    positions: Float32[np.ndarray, "n 3"],
-    table: Float32[np.ndarray, "rows channels"],
-    scalings: Float32[np.ndarray, "levels"],
-    table_size: int,
-    gradient: Float32[np.ndarray, "n levels_x_channels"],
-) -> Float32[np.ndarray, "rows channels"]:
-    """Gradient with respect to the table; threads share the levels, whose rows are apart."""
-    grad_table = np.zeros_like(table)
-    arguments = positions, scalings, table_size - 1, gradient, grad_table
-    run_in_parts(_add_to_table, _add_to_table_at_once, len(positions), *arguments)
-    return grad_table
-
-
-def position_gradient(
-    positions: Float32[np.ndarray, "n 3"],
-    table: Float32[np.ndarray, "rows channels"],
-    scalings: Float32[np.ndarray, "levels"],
-    table_size: int,
-    gradient: Float32[np.ndarray, "n levels_x_channels"],
-) -> Float32[np.ndarray, "n 3"]:
-    """Gradient with respect to the positions."""
-    grad_positions = np.zeros_like(positions)
-    arguments = positions, table, scalings, table_size - 1, gradient, grad_positions
-    run_in_parts(_position_gradients, _position_gradients_at_once, len(positions), *arguments)
-    return grad_positions

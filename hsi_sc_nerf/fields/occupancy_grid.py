@@ -170,8 +170,8 @@ def pixels_of_cells(
     centres_m = lower_m + (np.argwhere(surface) + 0.5) * cell_m
     seen = np.zeros((len(camera_to_worlds), intrinsics.h, intrinsics.w), bool)
     for pixels, pose in zip(seen, camera_to_worlds, strict=True):
-        places, depth_m = project(centres_m, pose, intrinsics)
-        x, y = np.floor(places).astype(int).T
+        centres_px, depth_m = project(centres_m, pose, intrinsics)
+        x, y = np.floor(centres_px).astype(int).T
         inside = (depth_m > 0.0) & (x >= 0) & (x < intrinsics.w) & (y >= 0) & (y < intrinsics.h)
         pixels[y[inside], x[inside]] = True
         cell_px = intrinsics.fl_x * 1.8 * cell_m / depth_m.min()

@@ -97,14 +97,14 @@ def _spread(seen, count, explored, weights):
 def _invert(weights, count, total, near, cell, starts, ends):
     """Samples of equal weight, each within the stretch of matter that its middle is in."""
     samples = len(starts)
-    share = total / np.float32(samples + 1)
+    spacing = total / np.float32(samples + 1)
     k, passed = 0, np.float32(0.0)
     while weights[k] == 0.0:
         k += 1
     first = k  # of the stretch of matter that step k is in
     # Quantiles in half steps: starts at even ones, ends two later, middles at odd ones.
     for half in range(2 * samples + 1):
-        level = np.float32(0.5) * np.float32(half + 1) * share
+        level = np.float32(0.5) * np.float32(half + 1) * spacing
         while passed + weights[k] <= level:
             following = k + 1
             while following < count and weights[following] == 0.0:

@@ -152,8 +152,8 @@ class SpectralField(NerfactoField):
         spectra = self.mlp_head(torch.cat(inputs, dim=-1).to(ray_samples.frustums.directions))
         if self.shading is not None:
             assert self._sample_locations is not None
-            places = (self._sample_locations.detach(), ray_samples.frustums.origins[..., :1, :].detach())
-            positions, origins = (of_samples(place).reshape(-1, 3) for place in places)
+            points = (self._sample_locations.detach(), ray_samples.frustums.origins[..., :1, :].detach())
+            positions, origins = (of_samples(point).reshape(-1, 3) for point in points)
             shaded = self.shading(spectra.flatten(0, -2), positions, origins)
             spectra = shaded.view_as(spectra)
         if seen is not None:

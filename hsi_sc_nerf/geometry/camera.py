@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 # Multiplying a camera-to-world pose by this on the right turns OpenCV axes (y down, looking along +z) into
 # OpenGL axes (y up, looking along -z), and back.
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
+"""Azimuth from one direction to the next on a Fibonacci spiral, rad."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from hsi_sc_nerf.evaluation.spatial import sample_surface
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, image_coordinates, unit_vectors
 from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene, unoccluded
-from hsi_sc_nerf.light.views import Views
+from hsi_sc_nerf.light.views import ElementViews
 
 SUPPORT_SIDES = 25
 """Triangles of the support along the disc's radius: 4 mm on a turntable, so that each belongs to one element."""
@@ -173,7 +173,7 @@ def support_mesh(container_m: tuple[float, float] | None, disc_radius_m: float) 
     return Mesh(mesh.vertices, mesh.triangles[mesh.triangle_areas_m2() > 0.0])
 
 
-def observe(
+def observe_elements(
     elements: Elements,
     camera_to_world: Float[np.ndarray, "frames 4 4"],
     intrinsics: PinholeIntrinsics,
@@ -181,7 +181,7 @@ def observe(
     masks: Bool[np.ndarray, "frames lines samples"],
     pixels: Pixels,
     lift_m: float,
-) -> Views:
+) -> ElementViews:
     """Measurements of the visible elements in the frames, interpolated between four pixels.
 
     Either all four pixels belong to the object or none does.
@@ -227,4 +227,4 @@ def observe(
         std = MISPLACED_PX * np.hypot(across, along)[whole] / np.maximum(value.mean(axis=1), SMALLEST)
         found.append((seen[whole], np.full(len(value), frame), value, std))
     element, frames, reflectance, std = (np.concatenate(column) for column in zip(*found, strict=True))
-    return Views(element, frames, reflectance, elements.on_object[element], std)
+    return ElementViews(element, frames, reflectance, elements.on_object[element], std)

@@ -19,18 +19,18 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.geometry.camera import unit_vectors
-from hsi_sc_nerf.light.shared_errors import CORRELATED, SMALLEST_SCATTER, SharedErrors, scatter_beyond, tukey_weights
+from hsi_sc_nerf.light.shared_errors import CORRELATED, SMALLEST_SCATTER, SharedErrors, scatter_beyond
 from hsi_sc_nerf.light.stationary_light import (
     DEGREE_OF_TERM,
     TERMS,
     StationaryLight,
+    even_chamber,
     even_directions,
-    even_light,
     tangents,
     unit_irradiance,
 )
-from hsi_sc_nerf.light.views import LampUnits, TurningElements, Views
-from hsi_sc_nerf.robust_scatter import robust_std
+from hsi_sc_nerf.light.views import ElementViews, LampUnits, TurningElements
+from hsi_sc_nerf.robust_scatter import robust_std, tukey_weights
 
 MOST_LAMPS = 4
 CANDIDATES = 200
@@ -92,7 +92,7 @@ class LightFit:
     relative_std: Float[np.ndarray, "m"]
 
 
-def fit_light(elements: TurningElements, views: Views, white_normal: Float[np.ndarray, "3"]) -> LightFit:
+def fit_light(elements: TurningElements, views: ElementViews, white_normal: Float[np.ndarray, "3"]) -> LightFit:
     """Fit light and materials.
 
     Args:
@@ -100,7 +100,7 @@ def fit_light(elements: TurningElements, views: Views, white_normal: Float[np.nd
         views: their measurements.
         white_normal: outward unit normal of the white reference, camera's frame.
     """
-    fit = _Fit(elements, views, white_normal)
+    fit = _LightFitting(elements, views, white_normal)
     fit.converge()
     while len(fit.light.lamps) < MOST_LAMPS:
         before = fit.state()
@@ -119,10 +119,10 @@ def fit_light(elements: TurningElements, views: Views, white_normal: Float[np.nd
     return fit.result()
 
 
-class _Fit:
+class _LightFitting:
     """State of the fit: the light, and what follows from it."""
 
-    def __init__(self, elements: TurningElements, views: Views, white: np.ndarray) -> None:
+    def __init__(self, elements: TurningElements, views: ElementViews, white: np.ndarray) -> None:
         self.elements, self.views, self.white = elements, views, white
         count = len(views.element), len(elements.positions)
         entries = np.ones(count[0]), (views.element, np.arange(count[0]))
@@ -134,7 +134,7 @@ class _Fit:
         occluded = 1.0 - elements.transfer.sky[views.element]
         self._own_std = np.hypot(views.own_std, OCCLUSION_ERROR * occluded)
         self._precision = np.zeros(count[0])
-        self.light = even_light(views.reflectance.shape[1])
+        self.light = even_chamber(views.reflectance.shape[1])
         self.weights, self.scatter = np.ones(count[0]), 0.0
         self.unevenness = UNEVENNESS_AT_FIRST
         self.bounced = np.zeros((count[0], views.reflectance.shape[1]), np.float32)
@@ -273,7 +273,8 @@ class _Fit:
         self.scatter = float(robust_std(residual[used], least=SMALLEST_SCATTER))
         beyond = scatter_beyond(residual[used], self._own_std[used])
         std = np.hypot(beyond, self._own_std)
-        self.weights = np.where(used, tukey_weights(residual / std), 1.0)
+        # Never 0, so that no element is left without a measurement.
+        self.weights = np.where(used, np.maximum(tukey_weights(residual / std), 1e-6), 1.0)
         self._precision = self.weights * used / std**2
 
     def _prior(self) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from hsi_sc_nerf.light.elements import NORMAL_WEIGHT, Elements, shown_points
 from hsi_sc_nerf.light.fit import LEAST_IRRADIANCE, OCCLUSION_ERROR, LightFit, fit_light
 from hsi_sc_nerf.light.stationary_light import even_directions
-from hsi_sc_nerf.light.views import TurningElements, Views, transfer
+from hsi_sc_nerf.light.views import ElementViews, TurningElements, transfer
 
 RAY_DIRECTIONS = 4096
 """Number of rays over the sphere: 3.2 degrees apart."""
@@ -38,7 +38,7 @@ class ObjectLight:
 
     elements: Elements
     turning: TurningElements
-    views: Views
+    views: ElementViews
     fit: LightFit
     spectral: LightFit
 
@@ -114,7 +114,7 @@ def turning_elements(
 
 
 def light_on_object(
-    elements: Elements, turning: TurningElements, views: Views, white_normal: Float[np.ndarray, "3"]
+    elements: Elements, turning: TurningElements, views: ElementViews, white_normal: Float[np.ndarray, "3"]
 ) -> ObjectLight:
     """Fit the light to groups of bands, and interpolate it to all bands.
 

@@ -14,11 +14,12 @@ import torch
 from jaxtyping import Float, Int
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.findings import CERTAIN
 from hsi_sc_nerf.geometry.mesh import Mesh
-from hsi_sc_nerf.light.elements import observe, spread_elements, support_mesh
+from hsi_sc_nerf.light.elements import observe_elements, spread_elements, support_mesh
 from hsi_sc_nerf.light.fit import LightFit
 from hsi_sc_nerf.light.material import ObjectLight, light_on_object, turning_elements
-from hsi_sc_nerf.light.views import TurningElements, Views
+from hsi_sc_nerf.light.views import ElementViews, TurningElements
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.processing.view_changes import like_spectra
@@ -36,8 +37,6 @@ LEAST_VIEWS = 200
 """Fewer measurements do not determine the light."""
 LEAST_UNEVENNESS = 0.01
 """Irradiance that varies by less over the object changes no result."""
-CERTAIN = 3.0
-"""Standard deviations by which an effect must exceed its noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +91,7 @@ def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"]) -> RunLi
         InputError: the run holds no object, or no frame sees enough of it.
 
     Example:
-        >>> found = light_of_run(open_run(Path("config.yml")), np.array([0.0, 0.0, 1.0]))
+        >>> found = light_of_run(open_trained_run(Path("config.yml")), np.array([0.0, 0.0, 1.0]))
         >>> irradiance, std = found.irradiance(cloud.points)
     """
     sampler, dataset = run.manager.train_pixel_sampler, run.dataset
@@ -117,7 +116,7 @@ def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"]) -> RunLi
         )
         return np.where(valid, reflectance, np.nan)
 
-    views = observe(elements, poses, renders.intrinsics, renders.distortion, sampler.masks, pixels, LIFT_M)
+    views = observe_elements(elements, poses, renders.intrinsics, renders.distortion, sampler.masks, pixels, LIFT_M)
     if views.shows_light.sum() < LEAST_VIEWS:
         raise InputError(
             "too few pixels of the object fit its surface; look at masks and poses in the dataset's report."
@@ -168,7 +167,7 @@ class ShadingEvidence:
         return turning or profile
 
 
-def shading_evidence(elements: TurningElements, views: Views, fit: LightFit) -> ShadingEvidence:
+def shading_evidence(elements: TurningElements, views: ElementViews, fit: LightFit) -> ShadingEvidence:
     """Look for uneven light.
 
     Args:

@@ -16,8 +16,6 @@ from hsi_sc_nerf.robust_scatter import robust_std
 
 CORRELATED = 8.0
 """Smallest number of measurements that count as one."""
-TUKEY = 4.685
-"""Cut-off of Tukey's weights in standard deviations: 95 % efficient for normal errors."""
 SMALLEST_SCATTER = 0.002
 
 
@@ -78,8 +76,3 @@ def scatter_beyond(residual: Float[np.ndarray, "m"], own_std: Float[np.ndarray, 
         else:
             high = middle
     return float(middle)
-
-
-def tukey_weights(scaled: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
-    """Tukey's biweight, but never 0, so that no element is left without a measurement."""
-    return np.maximum(np.where(np.abs(scaled) < TUKEY, (1.0 - (scaled / TUKEY) ** 2) ** 2, 0.0), 1e-6)

@@ -14,14 +14,13 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import sph_harm_y
 
-from hsi_sc_nerf.geometry.camera import unit_vectors
+from hsi_sc_nerf.geometry.camera import GOLDEN_ANGLE, unit_vectors
 
 DEGREE = 2
 """Largest degree of the chamber's harmonics: irradiance hardly shows higher ones (Ramamoorthi and Hanrahan 2001)."""
 TERMS = (DEGREE + 1) ** 2
 DEGREE_OF_TERM = np.repeat(np.arange(DEGREE + 1), 2 * np.arange(DEGREE + 1) + 1)
 FINE_DIRECTIONS = 1 << 13
-GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 LOBE_WIDTH_RAD = 0.055
 """Standard deviation of a lobe: that of a lamp of 22 cm at 1 m, and the distance between the rays' directions. A
 wider lobe lights beyond the terminator, which the fit makes up for by a stronger lamp (docs/validation/light.md)."""
@@ -53,7 +52,7 @@ class StationaryLight:
         return float(of_chamber @ self.chamber), float(of_lamps @ self.lamps)
 
 
-def even_light(bands: int) -> StationaryLight:
+def even_chamber(bands: int) -> StationaryLight:
     """The light of an even chamber without lamps."""
     return StationaryLight(np.eye(TERMS)[0], np.zeros(0), np.zeros((0, 3)), 0.0, np.ones(bands), np.ones(bands))
 

@@ -90,7 +90,7 @@ def transfer(
 
 
 @dataclass(frozen=True, eq=False)
-class Views:
+class ElementViews:
     """Measurements, one of an element in a frame each.
 
     Attributes:
@@ -163,14 +163,14 @@ class TurningElements:
             arriving = self.transfer.form_factors @ (material * (direct + arriving))
         return arriving
 
-    def chamber_at(self, views: Views) -> Float[np.ndarray, "m terms"]:
+    def chamber_at(self, views: ElementViews) -> Float[np.ndarray, "m terms"]:
         """Direct irradiance at measurements by each harmonic."""
         units = np.empty((len(views.element), self._harmonics[0].shape[1]), np.float32)
         for frame, rows in _by_frame(views):
             units[rows] = self.transfer.open_weights[views.element[rows]] @ self._harmonics[frame]
         return units
 
-    def lamps_at(self, views: Views, to_lamps: Float[np.ndarray, "lamps 3"]) -> LampUnits:
+    def lamps_at(self, views: ElementViews, to_lamps: Float[np.ndarray, "lamps 3"]) -> LampUnits:
         """Direct irradiance at measurements by lamps of strength 1, and its changes."""
         count, lamps = len(views.element), len(to_lamps)
         units = np.empty((count, 4 * lamps), np.float32)
@@ -192,7 +192,7 @@ class TurningElements:
         side = np.cbrt(np.ptp(self.positions[self.on_object], axis=0).prod()) / CELLS_ACROSS
         return _cell_numbers(self.positions / side)
 
-    def facing(self, views: Views) -> Int[np.ndarray, "m"]:
+    def facing(self, views: ElementViews) -> Int[np.ndarray, "m"]:
         """The cell of normals in the camera's frame that each measurement lies in."""
         normals = np.einsum("mk,mkj->mj", self.normals[views.element], self.rotations[views.frame])
         return _cell_numbers(normals / FACING_SIDE)
@@ -207,7 +207,7 @@ def _cell_numbers(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
     return np.unique(np.floor(points).astype(int), axis=0, return_inverse=True)[1].ravel()
 
 
-def _by_frame(views: Views) -> list[tuple[int, Int[np.ndarray, "rows"]]]:
+def _by_frame(views: ElementViews) -> list[tuple[int, Int[np.ndarray, "rows"]]]:
     return [(int(frame), np.flatnonzero(views.frame == frame)) for frame in np.unique(views.frame)]
 
 

@@ -35,7 +35,7 @@ def forward_pass(model: SpectralModel, rays: RayBundle, batch: Mapping[str, Tens
         return functools.reduce(torch.add, losses.values()), losses, metrics
 
 
-def run_step(model: SpectralModel, rays: RayBundle, batch: Mapping[str, Tensor]) -> Result:
+def forward_and_backward(model: SpectralModel, rays: RayBundle, batch: Mapping[str, Tensor]) -> Result:
     """Forward and backward pass; gradients are left in the parameters."""
     loss, losses, metrics = forward_pass(model, rays, batch)
     loss.backward()
@@ -116,7 +116,9 @@ class CapturedSteps:
             parts[kind][key] = value
         for parameter in self._parameters:
             parameter.grad = None
-        return run_step(self._model, RayBundle(**parts["rays"], metadata=parts["metadata"]), parts["batch"])
+        return forward_and_backward(
+            self._model, RayBundle(**parts["rays"], metadata=parts["metadata"]), parts["batch"]
+        )
 
     def _capture(self, seed: Callable[[], object]) -> _Captured:
         sampler = self._model.proposals

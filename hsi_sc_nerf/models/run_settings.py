@@ -29,52 +29,6 @@ _FUNCTIONS = (
 )
 
 
-class ForeignNameError(yaml.constructor.ConstructorError):
-    """The file names something that settings of a run are not made of."""
-
-
-class _SettingsLoader(yaml.Loader):
-    """yaml.Loader that takes names from `_PACKAGES` and torch's optimisers, and makes settings, paths and enums."""
-
-    def flatten_mapping(self, node: yaml.Node) -> None:
-        """Settings have no merge keys, by which a short file could stand for more than fits into memory."""
-
-    def find_python_name(self, name: str, mark: Any) -> Any:
-        package = name.partition(".")[0]
-        if name.startswith("pathlib."):
-            found = getattr(importlib.import_module("pathlib"), name.removeprefix("pathlib."), None)
-            allowed = isinstance(found, type) and issubclass(found, PurePath)
-        elif name in _FUNCTIONS:
-            found, allowed = super().find_python_name(name, mark), True  # type: ignore[misc]
-        elif package in _PACKAGES or name.startswith(f"{_OPTIMIZERS}."):
-            found = super().find_python_name(name, mark)  # type: ignore[misc]
-            # A module of ours may have imported something else, such as Popen.
-            home = found.__module__ if isinstance(found, type) else ""
-            allowed = home.partition(".")[0] in _PACKAGES or home.startswith(f"{_OPTIMIZERS}.")
-        else:
-            allowed = False
-        if not allowed:
-            raise ForeignNameError(None, None, f"it names {name}", mark)
-        return found
-
-    def find_python_module(self, name: str, mark: Any) -> Any:
-        raise ForeignNameError(None, None, f"it names the module {name}", mark)
-
-    def make_python_instance(
-        self,
-        suffix: str,
-        node: yaml.Node,
-        args: list | None = None,
-        kwds: dict | None = None,
-        newobj: bool = False,
-    ) -> Any:
-        kind = self.find_python_name(suffix, node.start_mark)
-        made_by_call = isinstance(kind, type) and issubclass(kind, enum.Enum | PurePath)
-        if not (made_by_call or (newobj and dataclasses.is_dataclass(kind))):
-            raise ForeignNameError(None, None, f"it makes a {suffix}", node.start_mark)
-        return super().make_python_instance(suffix, node, args, kwds, newobj)  # type: ignore[misc]
-
-
 def read_config(load_config: Path) -> TrainerConfig:
     """The settings of a run, of any method.
 
@@ -129,6 +83,52 @@ def discard_unbegun(folder: Path) -> None:
     with suppress(OSError):  # those of the experiment and the method may hold other runs
         for above in folder.parents[:2]:
             above.rmdir()
+
+
+class ForeignNameError(yaml.constructor.ConstructorError):
+    """The file names something that settings of a run are not made of."""
+
+
+class _SettingsLoader(yaml.Loader):
+    """yaml.Loader that takes names from `_PACKAGES` and torch's optimisers, and makes settings, paths and enums."""
+
+    def flatten_mapping(self, node: yaml.Node) -> None:
+        """Settings have no merge keys, by which a short file could stand for more than fits into memory."""
+
+    def find_python_name(self, name: str, mark: Any) -> Any:
+        package = name.partition(".")[0]
+        if name.startswith("pathlib."):
+            found = getattr(importlib.import_module("pathlib"), name.removeprefix("pathlib."), None)
+            allowed = isinstance(found, type) and issubclass(found, PurePath)
+        elif name in _FUNCTIONS:
+            found, allowed = super().find_python_name(name, mark), True  # type: ignore[misc]
+        elif package in _PACKAGES or name.startswith(f"{_OPTIMIZERS}."):
+            found = super().find_python_name(name, mark)  # type: ignore[misc]
+            # A module of ours may have imported something else, such as Popen.
+            home = found.__module__ if isinstance(found, type) else ""
+            allowed = home.partition(".")[0] in _PACKAGES or home.startswith(f"{_OPTIMIZERS}.")
+        else:
+            allowed = False
+        if not allowed:
+            raise ForeignNameError(None, None, f"it names {name}", mark)
+        return found
+
+    def find_python_module(self, name: str, mark: Any) -> Any:
+        raise ForeignNameError(None, None, f"it names the module {name}", mark)
+
+    def make_python_instance(
+        self,
+        suffix: str,
+        node: yaml.Node,
+        args: list | None = None,
+        kwds: dict | None = None,
+        newobj: bool = False,
+    ) -> Any:
+        kind = self.find_python_name(suffix, node.start_mark)
+        made_by_call = isinstance(kind, type) and issubclass(kind, enum.Enum | PurePath)
+        if not (made_by_call or (newobj and dataclasses.is_dataclass(kind))):
+            raise ForeignNameError(None, None, f"it makes a {suffix}", node.start_mark)
+        return super().make_python_instance(suffix, node, args, kwds, newobj)  # type: ignore[misc]
 
 
 def _missing_settings(value: object) -> bool:

@@ -35,14 +35,13 @@ from hsi_sc_nerf.fields.hash_grid import grid_for_dataset
 from hsi_sc_nerf.fields.occupancy_grid import OccupancyGrid
 from hsi_sc_nerf.fields.spectral_field import SpectralField
 from hsi_sc_nerf.models.backgrounds import make_background
-from hsi_sc_nerf.models.build_field import build_field
+from hsi_sc_nerf.models.build_field import build_field, build_proposals
 from hsi_sc_nerf.models.chosen_effects import chosen_effects, require_effects
 from hsi_sc_nerf.models.compositing import BasisDecoder, SpectralRenderer
 from hsi_sc_nerf.models.losses import angle_loss, angular_loss, free_space_loss, hsi_loss, separate_distortion
 from hsi_sc_nerf.models.occupancy_sampler import OccupancySampler, build_occupancy
 from hsi_sc_nerf.models.optimizers import with_network_group
 from hsi_sc_nerf.models.pose_refinement import PoseRefinement, PoseRefinementConfig
-from hsi_sc_nerf.models.proposals import build_proposals
 from hsi_sc_nerf.models.view_images import view_images
 from hsi_sc_nerf.numerics import safe_log10
 from hsi_sc_nerf.packed.dataset import PackedDataset

@@ -103,12 +103,7 @@ class StagedTrainerConfig(TrainerConfig):
                     "give each GPU a session of its own (hsi-sc-nerf batch)."
                 )
             for stage in stages:
-                for group in (*stage.frozen_groups, *stage.learn_after, *stage.group_lr):
-                    if group not in self.optimizers:
-                        raise InputError(
-                            f"the {stage.name} stage names the parameter group {group!r}; there are "
-                            f"{', '.join(self.optimizers)}."
-                        )
+                stage.require_groups(self.optimizers)
             if self.max_train_seconds is not None:
                 return plan_seconds(stages, self.max_train_seconds)
             return plan_stages(stages, self.max_num_iterations)

@@ -8,7 +8,7 @@ learning rates and its random numbers follow from the step alone, so that a resu
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -50,6 +50,18 @@ class StageConfig:
     grid_decay: float = between(0.0, math.inf, default=0.0)
     """Fraction by which the hash grid's features shrink in a step, over its learning rate. Features that few views
     reach fade, so that the surface is smooth between the views' outlines."""
+
+    def require_groups(self, known: Collection[str]) -> None:
+        """Refuse settings of a parameter group that is not among those known.
+
+        Raises:
+            InputError: there is such a setting.
+        """
+        for group in (*self.frozen_groups, *self.learn_after, *self.group_lr):
+            if group not in known:
+                raise InputError(
+                    f"the {self.name} stage names the parameter group {group!r}; there are {', '.join(known)}."
+                )
 
 
 def full_frame_stage() -> StageConfig:

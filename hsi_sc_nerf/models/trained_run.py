@@ -67,14 +67,14 @@ class TrainedRun:
         return result
 
 
-def open_run(load_config: Path) -> TrainedRun:
+def open_trained_run(load_config: Path) -> TrainedRun:
     """Open a run of hsi-sc-nerf by its ``config.yml``, with its latest checkpoint.
 
     Raises:
         InputError: there is no such file, it is no run of this version of hsi-sc-nerf, or there is no checkpoint.
 
     Example:
-        >>> run = open_run(Path("outputs/pear/hsi-sc-nerf/2026-11-22_101500/config.yml"))
+        >>> run = open_trained_run(Path("outputs/pear/hsi-sc-nerf/2026-11-22_101500/config.yml"))
         >>> run.to_metres(np.zeros(3))  # the centre of the scene in the object frame
     """
     config = read_config(load_config)

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, UInt8, UInt16
 from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import read_json, read_picture, write_json
-from hsi_sc_nerf.findings import Effect
+from hsi_sc_nerf.findings import EffectEvidence
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.packed.cube import ReflectanceUncertainty
 from hsi_sc_nerf.settings_file import read_dataclass
@@ -89,13 +89,6 @@ class PackedFrame:
         return _picture(self.image_path, 3)
 
 
-def _picture(path: Path, channels: Literal[1, 3]) -> UInt8[np.ndarray, "lines samples *channels"]:
-    image = read_picture(path, channels)
-    if image is None:
-        raise InputError(f"{path}: is not a readable picture; {_AGAIN}.")
-    return image
-
-
 @dataclass(frozen=True, eq=False)
 class PackedDataset:
     """The content of ``transforms.json``.
@@ -140,7 +133,7 @@ class PackedDataset:
     typical_uncertainty: Float[np.ndarray, "bands"] | None = None
     pose_method: str | None = None
     fingerprint: str | None = None
-    effects: tuple[Effect, ...] = ()
+    effects: tuple[EffectEvidence, ...] = ()
 
     def __repr__(self) -> str:
         camera, nm = self.intrinsics, self.wavelengths_nm
@@ -320,13 +313,13 @@ def _parse_transforms(root: Path, content: dict[str, Any], source: str) -> Packe
     )
 
 
-def _parse_effect(content: dict[str, Any]) -> Effect:
+def _parse_effect(content: dict[str, Any]) -> EffectEvidence:
     def number(name: str) -> float | None:
         return None if content[name] is None else float(content[name])
 
     name, unit, sentence = (str(content[key]) for key in ("name", "unit", "sentence"))
     evidence, noise, threshold = map(number, ("evidence", "noise", "threshold"))
-    return Effect(name, bool(content["present"]), evidence, noise, threshold, unit, sentence)
+    return EffectEvidence(name, bool(content["present"]), evidence, noise, threshold, unit, sentence)
 
 
 def _parse_frame(root: Path, frame: dict[str, Any]) -> PackedFrame:
@@ -348,3 +341,10 @@ def _parse_frame(root: Path, frame: dict[str, Any]) -> PackedFrame:
         camera_to_world=pose,
         **{name: root / file for name, file in files.items()},
     )
+
+
+def _picture(path: Path, channels: Literal[1, 3]) -> UInt8[np.ndarray, "lines samples *channels"]:
+    image = read_picture(path, channels)
+    if image is None:
+        raise InputError(f"{path}: is not a readable picture; {_AGAIN}.")
+    return image

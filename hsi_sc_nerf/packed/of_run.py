@@ -13,7 +13,7 @@ _KEYS = ("pipeline", "datamanager", "data")
 
 
 def require_dataset_of_run(load_config: Path) -> None:
-    """Look for the dataset where `hsi_sc_nerf.models.trained_run.open_run` will.
+    """Look for the dataset where `hsi_sc_nerf.models.trained_run.open_trained_run` will.
 
     A ``config.yml`` that is missing or that tells of no dataset is left to that.
 

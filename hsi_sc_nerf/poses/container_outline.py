@@ -30,9 +30,9 @@ _HEIGHTS = np.linspace(0.15, 0.7, 24)
 _AZIMUTHS = np.deg2rad(np.linspace(-60.0, 60.0, 24))
 # From one tried radius or height to the next, and standard deviation of the Gaussian over them.
 _STEP_PX, _SMOOTHING_PX = 0.2, 0.7
-# Least slope of the brightness at an edge, gray levels per pixel, and the percentage of its points that may have
+# Least gradient of the brightness at an edge, gray levels per pixel, and the percentage of its points that may have
 # less; and largest spread of the frames' results, as a fraction of the radius.
-_LEAST_SLOPE, _WEAKEST_PERCENTILE = 2.0, 20.0
+_LEAST_GRADIENT, _WEAKEST_PERCENTILE = 2.0, 20.0
 _LARGEST_SPREAD = 0.02
 _ROUNDS = 3
 # Radii or heights that are tried at least: wrong poses can leave an object of a pixel, or one that holds the camera.
@@ -75,16 +75,16 @@ def container_outline(
     # Until the foot is found, the lid is where the points end.
     feet_of_radii = lowest - heights
     for _ in range(_ROUNDS):
-        sides = _slopes(mean, turntable, _edges(radii, feet_of_radii, heights, turntable.distance)).min(axis=0)
+        sides = _gradients(mean, turntable, _edges(radii, feet_of_radii, heights, turntable.distance)).min(axis=0)
         radius = float(radii[np.argmax(sides)])
         height = 2.0 * radius * height_over_diameter
         feet = np.arange(lowest + (_LIDS[0] - 1.0) * height, lowest + (_LIDS[1] - 1.0) * height, step)
         if len(feet) < _FEWEST_TRIED:
             return None
-        arc = _slopes(mean, turntable, _arcs(radius, feet))[0]
+        arc = _gradients(mean, turntable, _arcs(radius, feet))[0]
         foot = float(feet[np.argmax(arc)])
         feet_of_radii = np.full(len(radii), foot)
-        if min(sides.max(), arc.max()) < _LEAST_SLOPE:
+        if min(sides.max(), arc.max()) < _LEAST_GRADIENT:
             return None
     radii, feet = (tried[np.abs(tried - at) < _REACH * radius] for tried, at in ((radii, radius), (feet, foot)))
     if min(len(radii), len(feet)) < _FEWEST_TRIED:
@@ -92,7 +92,7 @@ def container_outline(
     edges, arcs = _edges(radii, np.full(len(radii), foot), height, turntable.distance), _arcs(radius, feet)
     found = np.empty((len(pictures), 2))
     for row, picture in zip(found, pictures, strict=True):
-        sides, (arc,) = _slopes(picture, turntable, edges), _slopes(picture, turntable, arcs)
+        sides, (arc,) = _gradients(picture, turntable, edges), _gradients(picture, turntable, arcs)
         row[:] = np.mean([_peak(radii, side) for side in sides]), _peak(feet, arc)
     radius, foot = np.median(found, axis=0).tolist()
     scatter = 1.5 * np.median(np.abs(found - [radius, foot]), axis=0)
@@ -141,10 +141,10 @@ def _arcs(radius: float, feet: Float[np.ndarray, "z"]) -> Float[np.ndarray, "1 a
     return np.stack(np.broadcast_arrays(x, y, feet), axis=-1)[None]
 
 
-def _slopes(
+def _gradients(
     image: Float[np.ndarray, "h w"], turntable: Turntable, points: Float[np.ndarray, "k points n 3"]
 ) -> Float[np.ndarray, "k n"]:
-    """Slope of the brightness across each of n lines, which most of its points reach; 0 outside of the image.
+    """Gradient of the brightness across each of n lines, which most of its points reach; 0 outside of the image.
 
     An edge of the container extends over its whole height, in front of the disc and of the wall. Patterns on the wall
     do not.
@@ -158,9 +158,9 @@ def _slopes(
     return np.percentile(np.abs(np.nan_to_num(change)), _WEAKEST_PERCENTILE, axis=1)
 
 
-def _peak(tried: Float[np.ndarray, "n"], slopes: Float[np.ndarray, "n"]) -> float:
-    """The radius or height of the largest slope, between those that were tried, by a parabola."""
-    k = int(np.clip(np.argmax(slopes), 1, len(slopes) - 2))
-    before, at, after = slopes[k - 1 : k + 2]
+def _peak(tried: Float[np.ndarray, "n"], gradients: Float[np.ndarray, "n"]) -> float:
+    """The radius or height of the largest gradient, between those that were tried, by a parabola."""
+    k = int(np.clip(np.argmax(gradients), 1, len(gradients) - 2))
+    before, at, after = gradients[k - 1 : k + 2]
     bend = before - 2.0 * at + after
     return float(tried[k] + (tried[1] - tried[0]) * (0.5 * (before - after) / bend if bend < 0.0 else 0.0))

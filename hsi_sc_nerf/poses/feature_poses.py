@@ -20,7 +20,7 @@ from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, turntable_camera_to_w
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters
 from hsi_sc_nerf.poses.container_outline import container_outline
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
-from hsi_sc_nerf.poses.marker_observations import observe
+from hsi_sc_nerf.poses.marker_observations import observe_markers
 from hsi_sc_nerf.poses.model_selection import usable
 from hsi_sc_nerf.poses.object_frame import lie_on_disc, scale_of
 from hsi_sc_nerf.poses.posed_session import in_object_frame, pose_uncertainty
@@ -147,7 +147,7 @@ def poses_from_known_camera(
     )
 
 
-def poses_from_features(
+def poses_from_sfm(
     images: Images,
     names: Sequence[str],
     info: SessionInfo,
@@ -223,7 +223,7 @@ def _posed(
     dictionary = info.marker_dictionary or find_dictionary(images)
     markers, per_frame = None, (0,) * n
     if dictionary is not None:
-        markers, _, _ = usable(observe(images, dictionary).observations)
+        markers, _, _ = usable(observe_markers(images, dictionary).observations)
         markers = markers.select(np.isin(markers.frame, turntable.frames))
         per_frame = tuple(np.bincount(markers.frame, minlength=n).tolist())
     adjusted, markers = adjust_together(found, markers, parameters)

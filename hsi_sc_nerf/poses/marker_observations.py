@@ -47,7 +47,7 @@ class Observed:
     unexplained: tuple[RejectedMarker, ...]
 
 
-def observe(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str) -> Observed:
+def observe_markers(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str) -> Observed:
     """Detect and refine the markers of every frame."""
     session = SessionPictures.of(images)
     frames = session.frames

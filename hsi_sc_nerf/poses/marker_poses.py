@@ -13,14 +13,14 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_initialisation import initialise
-from hsi_sc_nerf.poses.marker_observations import observe, observe_expected
+from hsi_sc_nerf.poses.marker_observations import observe_expected, observe_markers
 from hsi_sc_nerf.poses.model_selection import LOSS_SIGMAS, adjust_without_outliers, usable, without_uncertain_frames
 from hsi_sc_nerf.poses.object_frame import lie_on_disc, scale_of
 from hsi_sc_nerf.poses.pixel_aspect import check_pixel_aspect, pixel_aspect
 from hsi_sc_nerf.poses.posed_session import in_object_frame, with_hidden_errors
 from hsi_sc_nerf.poses.residuals import MarkerResiduals, loop_closure_deg
 from hsi_sc_nerf.poses.result import RejectedMarker, TurntablePoses
-from hsi_sc_nerf.poses.session_pictures import check_frames
+from hsi_sc_nerf.poses.session_pictures import require_frames
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, require_parallax
 
 # Taken for the markers' side where only the container's diameter is known; any length would do.
@@ -54,10 +54,10 @@ def poses_from_markers(
         >>> poses = poses_from_markers(images, [f"frame_{i:03d}" for i in range(len(images))], info)
         >>> poses.camera_to_world.shape  # (frames, 4, 4), metres
     """
-    check_frames(images, names)
+    require_frames(images, names)
     _check_scale(info)
     dictionary = info.marker_dictionary or find_dictionary(images)
-    observed = observe(images, dictionary) if dictionary else None
+    observed = observe_markers(images, dictionary) if dictionary else None
     if dictionary is None or observed is None or len(observed.observations) == 0:
         raise InputError(
             f"no marker was found in any of the {len(images)} frames {names[0]} ... {names[-1]}; check that the "

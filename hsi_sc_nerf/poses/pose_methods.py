@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.poses.feature_poses import Images, KnownCamera, poses_from_features, poses_from_known_camera
+from hsi_sc_nerf.poses.feature_poses import Images, KnownCamera, poses_from_known_camera, poses_from_sfm
 from hsi_sc_nerf.poses.marker_poses import poses_from_markers
 from hsi_sc_nerf.poses.result import TurntablePoses
 
@@ -32,7 +32,7 @@ def find_poses(
     *,
     camera: KnownCamera | None = None,
     from_markers: Callable[..., TurntablePoses] = poses_from_markers,
-    from_features: Callable[..., TurntablePoses] = poses_from_features,
+    from_sfm: Callable[..., TurntablePoses] = poses_from_sfm,
 ) -> TurntablePoses:
     """Poses by one method, or by the first that works; the result names the method and why it was used.
 
@@ -43,7 +43,7 @@ def find_poses(
         camera: of an earlier session; poses from features start from its focal length, and with known angles poses
             need neither markers nor texture.
         from_markers: called like `poses_from_markers`.
-        from_features: called like `poses_from_features`.
+        from_sfm: called like `poses_from_sfm`.
 
     Raises:
         InputError: the method, or every method, fails; says why.
@@ -58,9 +58,9 @@ def find_poses(
         if method == "markers":
             return from_markers(images, names, info)
         if method == "colmap":
-            return _checked(from_features(images, names, info, camera=camera))
+            return _checked(from_sfm(images, names, info, camera=camera))
         if camera is None:
-            return _checked(from_features(images, names, info, hold_angles=True))
+            return _checked(from_sfm(images, names, info, hold_angles=True))
         height, width = images[0].shape
         return poses_from_known_camera(names, (width, height), info, camera)
 

@@ -98,7 +98,7 @@ class SessionPictures(Sequence[UInt8[np.ndarray, "h w"]]):
         return frame.picture(frame.ranking[0])
 
 
-def check_frames(images: Sequence[UInt8[np.ndarray, "h w"]], names: Sequence[str]) -> None:
+def require_frames(images: Sequence[UInt8[np.ndarray, "h w"]], names: Sequence[str]) -> None:
     """Refuse frames that cannot determine a turntable.
 
     Raises:

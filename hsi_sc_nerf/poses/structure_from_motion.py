@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.morphology import dilate, ellipse_close_open, touching
-from hsi_sc_nerf.poses.session_pictures import check_frames
+from hsi_sc_nerf.poses.session_pictures import require_frames
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, Tracks
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def structure_from_motion(
         InputError: nothing moves, or the object has too little texture to pose three frames.
         ValueError: images of different sizes, or not one name per image.
     """
-    check_frames(images, names)
+    require_frames(images, names)
     moving = moving_pixels(images)
     if not moving.any():
         raise InputError(

@@ -32,7 +32,7 @@ LEAST_IN_PATCH = 15
 """Fewest points of a part."""
 FEW = 0.1
 """Up to this fraction of the frames, those with different light are to be left out."""
-FEWEST_FRAMES, FEWEST_POINTS = 6, 200
+LEAST_FRAMES, LEAST_SHARED = 6, 200
 """Fewest frames with which one can be compared, and fewest points that two frames must share."""
 SLIPS_DEG = np.arange(-30.0, 30.1, 1.5)
 """Turns of the object on the disc that are tried."""
@@ -67,7 +67,7 @@ def check_appearance(views: PointViews, names: Sequence[str]) -> list[Finding]:
     Example:
         >>> refuse_red(check_appearance(point_views(bins, masks, poses, lens, distortion, hull), names))
     """
-    if len(np.unique(views.frame)) < FEWEST_FRAMES:
+    if len(np.unique(views.frame)) < LEAST_FRAMES:
         return []
     channels = without_stationary_light(views)
     light = _frames_light(views, channels, names)
@@ -204,7 +204,7 @@ def _change(
     points = views.positions_m[views.point[second]] @ before.T
     distance_m, nearest = tree.query(points, distance_upper_bound=MATCHED_M)
     near = np.isfinite(distance_m)
-    if near.sum() < FEWEST_POINTS:
+    if near.sum() < LEAST_SHARED:
         return None
     change = channels[second[near]] - channels[first[nearest[near]]]
     return change - np.median(change, axis=0)

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from hsi_sc_nerf.calibration.lamp_drift import SIGNIFICANCE, LampDriftEstimate, NotMeasurable
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.findings import CERTAIN, EFFECT_COLUMNS, Effect, effect_rows
+from hsi_sc_nerf.findings import CERTAIN, EFFECT_COLUMNS, EffectEvidence, effect_rows
 from hsi_sc_nerf.packed.cube import PixelFlag
 from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.plotting import new_figure, save_figure
@@ -67,7 +67,7 @@ def measure_effects(
     seen: PointViews | None,
     drift: tuple[LampDriftEstimate | NotMeasurable, bool],
     poses: TurntablePoses,
-) -> tuple[Effect, ...]:
+) -> tuple[EffectEvidence, ...]:
     """All effects, those that decide what the model simulates first.
 
     Args:
@@ -88,11 +88,11 @@ def measure_effects(
     )
 
 
-def view_dependence(change: Change | None) -> Effect:
+def view_dependence(change: Change | None) -> EffectEvidence:
     """Whether points look different from view to view, because of gloss or of lamps under which they turn."""
     if change is None:
         sentence = "Too little of the object is visible to decide, so the model shades points by direction."
-        return Effect("view_dependence", True, None, None, None, "%", sentence)
+        return EffectEvidence("view_dependence", True, None, None, None, "%", sentence)
     percent, noise = 100.0 * change.rms, 100.0 * change.noise
     return _decided(
         *("view_dependence", percent, noise, LEAST_VIEW_CHANGE_PERCENT, "%"),
@@ -102,11 +102,11 @@ def view_dependence(change: Change | None) -> Effect:
     )
 
 
-def still_chamber(change: Change | None) -> Effect:
+def still_chamber(change: Change | None) -> EffectEvidence:
     """Whether an image of the chamber is a better background than its median spectrum."""
     if change is None:
         sentence = "Too little of the chamber is visible to decide, so its median spectrum is the background."
-        return Effect("still_chamber", False, None, None, None, "reflectance", sentence)
+        return EffectEvidence("still_chamber", False, None, None, None, "reflectance", sentence)
     return _decided(
         *("still_chamber", change.rms, change.noise, LEAST_PICTURE, "reflectance"),
         "The chamber is stationary and uneven, so its image is the background.",
@@ -114,13 +114,13 @@ def still_chamber(change: Change | None) -> Effect:
     )
 
 
-def pose_refinement(poses: TurntablePoses, object_box_m: Float[np.ndarray, "2 3"]) -> Effect:
+def pose_refinement(poses: TurntablePoses, object_box_m: Float[np.ndarray, "2 3"]) -> EffectEvidence:
     """Whether training can improve the poses: whether their uncertainty moves the object's surface by enough."""
     if poses.uncertainty is None:
         refined = poses.method != "markers"
         what = "training refines them" if refined else "training does not refine them"
         sentence = f"The uncertainty of the poses is not known; for poses by {poses.method}, {what}."
-        return Effect("pose_refinement", refined, None, None, None, "px", sentence)
+        return EffectEvidence("pose_refinement", refined, None, None, None, "px", sentence)
     radius_m = float(np.abs(object_box_m[:, :2]).max())
     distance_m = float(np.linalg.norm(poses.camera_to_world[poses.used, :2, 3], axis=1).mean())
     error_px = poses.intrinsics.fl_x / distance_m * radius_m * np.deg2rad(poses.uncertainty.rotation_deg)
@@ -131,10 +131,10 @@ def pose_refinement(poses: TurntablePoses, object_box_m: Float[np.ndarray, "2 3"
     )
 
 
-def lamp_drift(drift: LampDriftEstimate | NotMeasurable, corrected: bool) -> Effect:
+def lamp_drift(drift: LampDriftEstimate | NotMeasurable, corrected: bool) -> EffectEvidence:
     """The lamps' drift as calibration has decided it."""
     if isinstance(drift, NotMeasurable):
-        return Effect(
+        return EffectEvidence(
             "lamp_drift", False, None, None, None, "-log10 p", f"Its drift was not measured: {drift.reason}."
         )
     change = 100.0 * (drift.factor - 1.0)
@@ -142,12 +142,12 @@ def lamp_drift(drift: LampDriftEstimate | NotMeasurable, corrected: bool) -> Eff
     done = "corrected" if corrected else "not corrected"
     evidence = max(0.0, -float(np.log10(max(drift.p_value, 1e-99))))
     sentence = f"The lamps changed by up to {largest:+.2f} %, which calibration has {done}."
-    return Effect(
+    return EffectEvidence(
         "lamp_drift", corrected, evidence, _LOG_P_NOISE, float(-np.log10(SIGNIFICANCE)), "-log10 p", sentence
     )
 
 
-def lens_distortion(poses: TurntablePoses) -> Effect:
+def lens_distortion(poses: TurntablePoses) -> EffectEvidence:
     """The lens as the poses have decided it."""
     k1, k2 = poses.distortion[:2]
     radius = np.hypot(poses.intrinsics.w, poses.intrinsics.h) / 2.0 / poses.intrinsics.fl_x
@@ -155,14 +155,14 @@ def lens_distortion(poses: TurntablePoses) -> Effect:
     return _by_poses(poses, "lens_distortion", bool(k1 or k2), f"moves the picture's corners by {shift_px:.2g} px")
 
 
-def wobble(poses: TurntablePoses) -> Effect:
+def wobble(poses: TurntablePoses) -> EffectEvidence:
     """The table's wobble as the poses have decided it."""
     return _by_poses(
         poses, "wobble", poses.model == "free poses", f"tilts the table by {poses.wobble_deg or 0.0:.2g}°"
     )
 
 
-def saturated_highlights(dataset: PackedDataset, masks: Bool[np.ndarray, "frames h w"]) -> Effect:
+def saturated_highlights(dataset: PackedDataset, masks: Bool[np.ndarray, "frames h w"]) -> EffectEvidence:
     """Saturated pixels on the object, whose values losses and metrics leave out."""
     saturated = sum(
         int(((frame.flags() & PixelFlag.SATURATED > 0) & mask).sum())
@@ -176,23 +176,23 @@ def saturated_highlights(dataset: PackedDataset, masks: Bool[np.ndarray, "frames
     )
 
 
-def spectral_rank(dataset: PackedDataset) -> Effect:
+def spectral_rank(dataset: PackedDataset) -> EffectEvidence:
     """Number of spectra that span all others above the noise; training determines it again from its own frames."""
     bands = len(dataset.wavelengths_nm)
     try:
         rank = training_subspace(dataset, dataset.frames).basis.shape[1]
     except InputError:
         sentence = "Too few spectra are free of flagged values to determine the rank."
-        return Effect("spectral_rank", False, None, None, None, "spectra", sentence)
+        return EffectEvidence("spectral_rank", False, None, None, None, "spectra", sentence)
     sentence = f"{rank} spectra span those of all {bands} bands above the noise, and the field emits {rank} numbers."
-    return Effect("spectral_rank", rank < bands, float(rank), None, 1.0, "spectra", sentence)
+    return EffectEvidence("spectral_rank", rank < bands, float(rank), None, 1.0, "spectra", sentence)
 
 
-def uneven_light(seen: PointViews | None) -> Effect:
+def uneven_light(seen: PointViews | None) -> EffectEvidence:
     """A hint only: `hsi-sc-nerf material` decides it after training, when the surface is known."""
     if seen is None:
         sentence = "Too little of the object is visible to decide; `material` decides after training."
-        return Effect("uneven_light", False, None, None, None, "%", sentence)
+        return EffectEvidence("uneven_light", False, None, None, None, "%", sentence)
     change = change_with_height(seen)
     return _decided(
         *("uneven_light", 100.0 * change.rms, 100.0 * change.noise, LEAST_HEIGHT_CHANGE_PERCENT, "%"),
@@ -201,14 +201,14 @@ def uneven_light(seen: PointViews | None) -> Effect:
     )
 
 
-def show_effects(console: Console, effects: Sequence[Effect]) -> None:
+def show_effects(console: Console, effects: Sequence[EffectEvidence]) -> None:
     """Print the effects as a table, and what they mean."""
     console.print(screen_table(EFFECT_COLUMNS, effect_rows(effects), title="Effects in the session"))
     for effect in effects:
         console.print(f"{effect.name}: {effect.sentence}", highlight=False, markup=False, soft_wrap=True)
 
 
-def draw_effects(path: Path, effects: Sequence[Effect]) -> None:
+def draw_effects(path: Path, effects: Sequence[EffectEvidence]) -> None:
     """Draw the evidence of each effect as a multiple of its threshold.
 
     Raises:
@@ -236,17 +236,17 @@ def draw_effects(path: Path, effects: Sequence[Effect]) -> None:
 
 def _decided(
     name: str, evidence: float, noise: float, least: float, unit: str, if_present: str, if_absent: str
-) -> Effect:
+) -> EffectEvidence:
     """The effect, which is present if its evidence exceeds both a least size and its noise."""
     threshold = max(least, CERTAIN * noise)
     present = evidence > threshold
-    return Effect(name, present, evidence, noise, threshold, unit, if_present if present else if_absent)
+    return EffectEvidence(name, present, evidence, noise, threshold, unit, if_present if present else if_absent)
 
 
-def _by_poses(poses: TurntablePoses, name: str, present: bool, does: str) -> Effect:
+def _by_poses(poses: TurntablePoses, name: str, present: bool, does: str) -> EffectEvidence:
     if name not in poses.evidence:
         known = f", but it is known: it {does}" if present else ""
         sentence = f"Poses by {poses.method} are not tested for it{known}."
-        return Effect(name, present, None, None, None, "-log10 p", sentence)
+        return EffectEvidence(name, present, None, None, None, "-log10 p", sentence)
     sentence = f"It {does}, and the poses include it." if present else "The markers show no sign of it."
-    return Effect(name, present, poses.evidence[name], _LOG_P_NOISE, EVIDENCE_NEEDED, "-log10 p", sentence)
+    return EffectEvidence(name, present, poses.evidence[name], _LOG_P_NOISE, EVIDENCE_NEEDED, "-log10 p", sentence)

@@ -48,7 +48,7 @@ _CONSTANT_RATE_FACTOR = "18"
 """Quality of x264: visually lossless."""
 
 
-def compare(
+def compare_view(
     folder: Path, name: str, view: RenderedView, item: Mapping[str, Any], rgb_bands: Sequence[int]
 ) -> dict[str, float]:
     """Metrics of a rendered frame on the object; ``NAME.png`` shows it beside the measured frame.
@@ -63,7 +63,7 @@ def compare(
     return spectral_metrics(view.spectral, item["spectral"], item["mask"][..., 0].bool(), item.get("valid"))
 
 
-def write_report(path: Path, rows: Sequence[Mapping[str, Any]], legends: Mapping[str, str]) -> None:
+def write_render_report(path: Path, rows: Sequence[Mapping[str, Any]], legends: Mapping[str, str]) -> None:
     """Write a table of the views as ``PATH.md`` and ``PATH.json``.
 
     Args:

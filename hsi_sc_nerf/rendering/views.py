@@ -55,7 +55,7 @@ def views_of_frames(run: TrainedRun, split: Literal["held-out", "training"]) -> 
     """The cameras of a split's frames, and the measured frames.
 
     Example:
-        >>> run = open_run(Path("config.yml"))
+        >>> run = open_trained_run(Path("config.yml"))
         >>> for name, camera in views_of_frames(run, "held-out"):
         ...     view = render_view(run.model, camera)
     """
@@ -131,7 +131,7 @@ def render_view(model: SpectralModel, camera: Cameras) -> RenderedView:
     """Render one camera (scene units) of a model in evaluation mode; the result is on the CPU.
 
     Example:
-        >>> run = open_run(Path("config.yml"))
+        >>> run = open_trained_run(Path("config.yml"))
         >>> view = render_view(run.model, run.manager.eval_dataset.cameras[:1])
     """
     outputs = model.get_outputs_for_camera(camera.to(model.device))

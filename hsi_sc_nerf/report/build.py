@@ -79,11 +79,11 @@ class ReportSources:
 def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
     """Write the report of the run in ``folder``, completely or not at all.
 
-    Example:
-        >>> write_report(Path("outputs/pear/hsi-sc-nerf/run"), Path("report.html"), ReportSources(views=4))
-
     Raises:
         InputError: the run, its dataset or a file given cannot be used, or the report cannot be written.
+
+    Example:
+        >>> write_report(Path("outputs/pear/hsi-sc-nerf/run"), Path("report.html"), ReportSources(views=4))
     """
     if (sources.views is not None and sources.views < 1) or sources.points < 1:
         raise InputError("--views and --points must be at least 1.")
@@ -96,9 +96,9 @@ def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
         indices = [*sources.indices] or [str(word) for word in each_object(traits or {})[0].get("indices", ())]
     calibrations = [read_calibration(path) for path in sources.calibrations]
 
-    from hsi_sc_nerf.models.trained_run import open_run
+    from hsi_sc_nerf.models.trained_run import open_trained_run
 
-    run = open_run(folder / "config.yml")
+    run = open_trained_run(folder / "config.yml")
     cloud = _cloud(run, folder, sources)
     shown = object_section(cloud, sources.points, indices, calibrations)
     views, held_out, dataset = _rendered(run, sources.views), len(run.manager.eval_dataset), run.dataset

@@ -41,12 +41,6 @@ _MASK_JUMP = 0.1
 _REPROJECTION_PX = 1.0
 
 
-def _folded_picture(dataset: PackedDataset, name: str, summary: str) -> list[Block]:
-    """A picture of the dataset's ``report/``, which a click opens; nothing where it is missing."""
-    path = dataset.root / "report" / name
-    return [Folded(summary, [Figure([embedded_file(path, summary)], f"{summary}.")])] if path.is_file() else []
-
-
 def inspection_section(dataset: PackedDataset) -> list[Section]:
     """What `hsi-sc-nerf inspect` found in the session, as ``report/inspection.json`` of the dataset keeps it.
 
@@ -89,15 +83,12 @@ def calibration_section(dataset: PackedDataset) -> Section:
     path = dataset.root / "calibration.json"
     found = read_known(path)
     with content_of(path, "calibration"):
-        return _calibration_section(dataset, found)
-
-
-def _calibration_section(dataset: PackedDataset, found: dict[str, Any] | None) -> Section:
-    if found is None:
-        missing = Missing("The dataset has no calibration.json, so nothing is known of its calibration.", _PROCESS)
-        blocks: list[Block] = [missing]
-    else:
-        blocks = [_calibration_table(dataset, found), *_flagged_values(dataset, found)]
+        if found is None:
+            sentence = "The dataset has no calibration.json, so nothing is known of its calibration."
+            blocks: list[Block] = [Missing(sentence, _PROCESS)]
+        else:
+            blocks = [_calibration_table(dataset, found), *_flagged_values(dataset, found)]
+        findings = judge_calibration(dataset.flagged_values / _values(dataset), (found or {}).get("lamp_drift") or {})
     if dataset.typical_uncertainty is not None:
         chart = line_chart(
             [Curve("", dataset.wavelengths_nm, dataset.typical_uncertainty)],
@@ -114,7 +105,6 @@ def _calibration_section(dataset: PackedDataset, found: dict[str, Any] | None) -
         ("uncertainty.png", "Uncertainty by reflectance and band"),
     ):
         blocks += _folded_picture(dataset, name, summary)
-    findings = judge_calibration(dataset.flagged_values / _values(dataset), (found or {}).get("lamp_drift") or {})
     return Section("calibration", "Calibration", blocks, findings)
 
 
@@ -226,15 +216,12 @@ def poses_section(dataset: PackedDataset) -> Section:
     """
     path = dataset.root / "poses.json"
     found = read_known(path)
-    with content_of(path, "poses"):
-        return _poses_section(dataset, found)
-
-
-def _poses_section(dataset: PackedDataset, found: dict[str, Any] | None) -> Section:
     if found is None:
         missing = Missing("The dataset has no poses.json, so nothing is known of how its poses were found.", _PROCESS)
         return Section("poses", "Poses", [missing])
-    blocks: list[Block] = [Table("The turntable and the camera.", ("", "found"), _pose_rows(found))]
+    with content_of(path, "poses"):
+        blocks: list[Block] = [Table("The turntable and the camera.", ("", "found"), _pose_rows(found))]
+        findings = judge_poses(found)
     errors = np.array([np.nan if (e := f.reprojection_error_px) is None else e for f in dataset.frames])
     charts: dict[str, Markup] = {}
     if np.isfinite(errors).any():
@@ -248,7 +235,7 @@ def _poses_section(dataset: PackedDataset, found: dict[str, Any] | None) -> Sect
         caption = "Root mean square reprojection error in pixels; turn of the table, positive counter-clockwise."
         blocks.append(Figure(list(charts.values()), caption, list(charts), columns=2))
     blocks += _folded_picture(dataset, "poses.png", "Cameras round the object, reprojection errors and steps")
-    return Section("poses", "Poses", blocks, judge_poses(found))
+    return Section("poses", "Poses", blocks, findings)
 
 
 def judge_poses(found: Mapping[str, Any]) -> list[Finding]:
@@ -294,3 +281,9 @@ def _pose_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("rejected observations", "{}", len(found.get("outliers") or ())),
     ]
     return [(name, pattern.format(value)) for name, pattern, value in candidates if value is not None]
+
+
+def _folded_picture(dataset: PackedDataset, name: str, summary: str) -> list[Block]:
+    """A picture of the dataset's ``report/``, which a click opens; nothing where it is missing."""
+    path = dataset.root / "report" / name
+    return [Folded(summary, [Figure([embedded_file(path, summary)], f"{summary}.")])] if path.is_file() else []

@@ -42,7 +42,7 @@ class HeldOutView:
     scores: ViewScores
     measured_rgb: Float[np.ndarray, "h w 3"]
     rendered_rgb: Float[np.ndarray, "h w 3"]
-    points: list[PointSpectra]
+    points: list[PixelSpectra]
 
 
 def render_held_out(run: TrainedRun, views: int) -> Iterator[HeldOutView]:
@@ -123,7 +123,7 @@ def score_view(
     )
 
 
-def mean_and_sd(
+def sample_mean_and_sd(
     values: Float[np.ndarray, "n bands"],
 ) -> tuple[Float[np.ndarray, "bands"], Float[np.ndarray, "bands"]]:
     """Mean and standard deviation of a sample (one degree of freedom less) over the first axis, without NaN.
@@ -151,7 +151,7 @@ def spread_of_views(count: int, number: int) -> list[int]:
 
 
 @dataclass(frozen=True, eq=False)
-class PointSpectra:
+class PixelSpectra:
     """Spectra of the object's pixels within a circle around a point of a view.
 
     Attributes:
@@ -185,7 +185,7 @@ def point_spectra(
     mask: Bool[np.ndarray, "h w"],
     points: Sequence[tuple[int, int]],
     radius_px: float,
-) -> list[PointSpectra]:
+) -> list[PixelSpectra]:
     """Spectra of the object's pixels within a circle around each point; values that are NaN in ``measured`` are
     ignored in both."""
     lines, samples = np.indices(mask.shape)
@@ -193,6 +193,6 @@ def point_spectra(
     for line, sample in points:
         inside = mask & ((lines - line) ** 2 + (samples - sample) ** 2 <= radius_px**2)
         here = measured[inside].astype(float)
-        mean_rendered, _ = mean_and_sd(np.where(np.isfinite(here), rendered[inside], np.nan))
-        found.append(PointSpectra(line, sample, int(inside.sum()), *mean_and_sd(here), mean_rendered))
+        mean_rendered, _ = sample_mean_and_sd(np.where(np.isfinite(here), rendered[inside], np.nan))
+        found.append(PixelSpectra(line, sample, int(inside.sum()), *sample_mean_and_sd(here), mean_rendered))
     return found

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.analysis.report import each_object, trait_tables
+from hsi_sc_nerf.analysis.report import MM_PER_M, each_object, trait_tables
 from hsi_sc_nerf.evaluation.comparison_report import comparison_tables
 from hsi_sc_nerf.files import content_of
 from hsi_sc_nerf.findings import Finding, judged
@@ -37,7 +37,6 @@ _CHECKPOINT = re.compile(r"step-(\d+)\.ckpt")
 MOST_POINTS = 400
 """Longer curves are averaged to this many points."""
 _PSNR_RISE_DB = 0.5
-_MM_PER_M = 1000.0
 _CURVES = {"precision": "precision", "recall": "recall", "f_score": "F-score"}
 _F_SCORE_MISSING_PERCENT = (10.0, 30.0)
 _UNSEEN_FRACTION = 0.15
@@ -228,13 +227,13 @@ def judge_comparison(comparison: Mapping[str, Any]) -> list[Finding]:
 def comparison_key_figure(comparison: Mapping[str, Any]) -> dict[str, str]:
     """The F-score at the chosen threshold, for the head of the page."""
     score = comparison["scores"]["chosen"]
-    return {f"F-score at {_MM_PER_M * score['threshold_m']:.1f} mm": f"{score['f_score']:.1f} %"}
+    return {f"F-score at {MM_PER_M * score['threshold_m']:.1f} mm": f"{score['f_score']:.1f} %"}
 
 
 def _comparison_blocks(comparison: Mapping[str, Any]) -> list[Block]:
     found, scores = comparison["curves"], comparison["scores"]
-    thresholds_mm = _MM_PER_M * np.array(found["thresholds_m"], float)
-    marks_mm = {key: _MM_PER_M * float(scores[key]["threshold_m"]) for key in ("chosen", "knee")}
+    thresholds_mm = MM_PER_M * np.array(found["thresholds_m"], float)
+    marks_mm = {key: MM_PER_M * float(scores[key]["threshold_m"]) for key in ("chosen", "knee")}
     drawn = thresholds_mm <= _DRAWN_THRESHOLDS * max(marks_mm.values())
     curves = [
         Curve(name, thresholds_mm[drawn], np.array(found[key], float).reshape(len(thresholds_mm))[drawn])

@@ -16,10 +16,10 @@ from hsi_sc_nerf.plotting import ANGLE_COLOURS, ANGLE_DRAWN_RAD, ERROR_DRAWN, co
 from hsi_sc_nerf.report.charts import Curve, line_chart
 from hsi_sc_nerf.report.held_out_views import (
     HeldOutView,
-    PointSpectra,
+    PixelSpectra,
     ViewScores,
-    mean_and_sd,
     object_angles,
+    sample_mean_and_sd,
     spread_of_views,
 )
 from hsi_sc_nerf.report.page import Block, Figure, Section, Table, embedded_array
@@ -61,7 +61,9 @@ def _over_views(views: Sequence[ViewScores], metric: str) -> tuple[str, str]:
     values = np.array([[view.metrics[metric]] for view in views if np.isfinite(view.metrics[metric])])
     if not len(values):
         return _NO_SCORE, _NO_SCORE
-    mean, sd, low, high = (pattern.format(float(v[0])) for v in (*mean_and_sd(values), values.min(0), values.max(0)))
+    mean, sd, low, high = (
+        pattern.format(float(v[0])) for v in (*sample_mean_and_sd(values), values.min(0), values.max(0))
+    )
     return f"{mean} ± {sd}", f"{low} to {high}"
 
 
@@ -155,7 +157,7 @@ def bands_section(
             Curve(
                 "mean ± SD over views",
                 wavelengths_nm,
-                *mean_and_sd(np.stack([getattr(view, name) for view in views])),
+                *sample_mean_and_sd(np.stack([getattr(view, name) for view in views])),
             )
         ]
         for name in ("rmse", "psnr_db", "ssim")
@@ -244,7 +246,7 @@ def spectra_section(view: HeldOutView, wavelengths_nm: Float[np.ndarray, "bands"
     return Section("spectra", "Spectra", blocks, judge_spectra(points))
 
 
-def judge_spectra(points: Mapping[str, PointSpectra]) -> list[Finding]:
+def judge_spectra(points: Mapping[str, PixelSpectra]) -> list[Finding]:
     """How far rendered mean spectra are from the measured ones, by the points' letters."""
     errors = {
         letter: float(np.nanmean(np.abs(one.rendered - one.measured)) / np.nanmean(one.measured))

@@ -23,7 +23,7 @@ from jaxtyping import Float
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.simulate.effect import Effect, of_kind
 from hsi_sc_nerf.simulate.render import Hits, Lens, Renderer
-from hsi_sc_nerf.simulate.surface import Surface
+from hsi_sc_nerf.simulate.surface import SceneSurface
 
 SECOND_RADIATION_CONSTANT_NM_K = 1.438776877e7  # h c / k_B
 FAINT = 1e-3
@@ -82,7 +82,7 @@ class Lighting:
     def __init__(self, renderer: Renderer, effects: Sequence[LightEffect]) -> None:
         self._on_view = of_kind(effects, ViewLightEffect)
         self._renderer = renderer
-        self._light = even_light(Surface(self._renderer))
+        self._light = even_light(SceneSurface(self._renderer))
         for effect in of_kind(effects, SurfaceLightEffect):
             self._light = effect.on_surface(self._light)
 
@@ -173,7 +173,7 @@ class SurfaceLight:
         reflection: how surfaces light each other; None if they do not.
     """
 
-    surface: Surface
+    surface: SceneSurface
     colours: tuple[Colour, ...]
     chamber_lit: Float[np.ndarray, "p colours"]
     lamp_lit: Float[np.ndarray, "p colours"]
@@ -261,7 +261,7 @@ class ViewLightEffect(Effect):
         raise NotImplementedError
 
     def on_points(
-        self, surface: Surface, camera_to_world: Float[np.ndarray, "4 4"]
+        self, surface: SceneSurface, camera_to_world: Float[np.ndarray, "4 4"]
     ) -> Float[np.ndarray, "p"] | float:
         """Irradiance that the effect adds at the points of a surface, which others reflect."""
         return 0.0
@@ -270,7 +270,7 @@ class ViewLightEffect(Effect):
 LightEffect: TypeAlias = SurfaceLightEffect | ViewLightEffect
 
 
-def even_light(surface: Surface) -> SurfaceLight:
+def even_light(surface: SceneSurface) -> SurfaceLight:
     """The light of a surface under the irradiance 1 at every point."""
     materials = surface.renderer.weights[surface.vertex]
     return SurfaceLight(surface, _single_colours(surface.renderer), materials, materials)

@@ -136,7 +136,10 @@ class Renderer:
         materials: material of each column of the weights; extra materials and then the chamber come last.
         vertices, triangles, weights: of all parts, concatenated.
         is_object: which triangles belong to the scanned object.
+        rays_at_once: of a camera, about; more take more memory.
     """
+
+    rays_at_once = RAYS_AT_ONCE
 
     def __init__(self, parts: Sequence[Part], extra_materials: Sequence[str] = ()) -> None:
         names = dict.fromkeys([name for part in parts for name in part.materials] + list(extra_materials))
@@ -169,7 +172,7 @@ class Renderer:
         lens: Lens | None = None,
     ) -> Iterator[tuple[slice, Hits]]:
         """Hits of the rays of a camera, a block of image lines at a time, which bounds the memory."""
-        lines = max(1, RAYS_AT_ONCE // (intrinsics.w * supersampling**2))
+        lines = max(1, self.rays_at_once // (intrinsics.w * supersampling**2))
         for first in range(0, intrinsics.h, lines):
             rows = slice(first, min(first + lines, intrinsics.h))
             directions = _camera_rays(intrinsics, rows.start, rows.stop, supersampling, lens)

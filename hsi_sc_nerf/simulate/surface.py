@@ -11,7 +11,7 @@ import trimesh
 from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 
-from hsi_sc_nerf.geometry.camera import unit_vectors
+from hsi_sc_nerf.geometry.camera import GOLDEN_ANGLE, unit_vectors
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.simulate.render import RAY_START_M, Renderer
 
@@ -20,7 +20,6 @@ CREASE_DEG = 40.0
 POINTS_AT_ONCE = 4096
 COVER_DISTANCE_M, COVER_FRACTION = 0.001, 0.6
 """A point is covered if this fraction of its rays hits a back face or, on the support, hits within the distance."""
-GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,7 @@ class Surroundings:
     form_factors: scipy.sparse.csr_array
 
 
-class Surface:
+class SceneSurface:
     """Points on all parts, one for each vertex, and several where facets meet at a crease.
 
     Attributes:

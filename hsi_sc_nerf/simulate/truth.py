@@ -171,7 +171,7 @@ def write_truth(session_dir: Path, simulation: Simulation) -> None:
         table = csv.writer(file)
         table.writerow(["wavelength_nm", *materials])
         table.writerows(np.column_stack([wavelengths_nm, simulation.endmembers.T]).tolist())
-    write_mesh(folder / "mesh.ply", simulation.object_part)
+    write_true_mesh(folder / "mesh.ply", simulation.object_part)
     maps: dict[str, Any] = {}
     for of_effect in simulation.detector_maps.values():
         maps |= of_effect
@@ -235,7 +235,7 @@ def _one_of(path: Path, arrays: Mapping[str, np.ndarray], name: str) -> np.ndarr
     return arrays[name]
 
 
-def write_mesh(path: Path, part: Part) -> None:
+def write_true_mesh(path: Path, part: Part) -> None:
     """Write a part as binary PLY with one vertex property ``weight_NAME`` for each material."""
     columns = dict(zip("xyz", part.mesh.vertices.T, strict=True))
     columns |= {f"weight_{n}": w for n, w in zip(part.materials, part.weights.T.astype(np.float32), strict=True)}

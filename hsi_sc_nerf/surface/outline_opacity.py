@@ -57,7 +57,7 @@ def outline_opacity(run: TrainedRun, rays_per_batch: int) -> float:
         rays_per_batch: rays rendered at a time.
 
     Example:
-        >>> outline_opacity(open_run(Path("config.yml")), rays_per_batch=4096)
+        >>> outline_opacity(open_trained_run(Path("config.yml")), rays_per_batch=4096)
         0.6
     """
     model, cameras = run.model, run.manager.train_dataset.cameras

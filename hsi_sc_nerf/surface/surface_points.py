@@ -139,6 +139,8 @@ def even_points(
     triangles: Int[np.ndarray, "t 3"],
     count: int,
     keep: Callable[[Float[np.ndarray, "n 3"]], SurfacePoints],
+    max_batch: int = _MAX_BATCH,
+    max_candidates: int = _MAX_CANDIDATES,
 ) -> SurfacePoints:
     """``count`` points spread evenly over a mesh's area, after ``keep`` has rejected some candidates.
 
@@ -149,16 +151,18 @@ def even_points(
         triangles: of the mesh.
         count: points to return; there are fewer if hardly any candidate is kept.
         keep: turns candidates on the mesh into as many or fewer points.
+        max_batch: candidates at a time.
+        max_candidates: in all, as a multiple of ``count``, or of ``max_batch`` where that is more.
     """
     rng = np.random.default_rng(0)
     parts: list[SurfacePoints] = []
     found = tried = 0
     batch = int(np.clip(count, *_PILOT_POINTS))
-    while found < count and tried < (_MAX_CANDIDATES * max(count, _MAX_BATCH) if found else _MAX_BATCH):
+    while found < count and tried < (max_candidates * max(count, max_batch) if found else max_batch):
         parts.append(keep(sample_surface(vertices, triangles, batch, seed=int(rng.integers(2**31)))))
         found, tried = found + len(parts[-1]), tried + batch
         needed = (count - found) * tried / found * _MARGIN + 1 if found else 10 * tried
-        batch = min(int(needed), _MAX_BATCH)
+        batch = min(int(needed), max_batch)
     return SurfacePoints.concatenate(parts).select(np.sort(rng.permutation(found)[:count]))
 
 

@@ -11,10 +11,10 @@ from results_table import RESULTS, read_results
 
 from hsi_sc_nerf.analysis.change import compare_days
 from hsi_sc_nerf.analysis.change_days import Day
-from hsi_sc_nerf.analysis.change_limit import LIMIT_M2, LIMIT_PART, limit_of_blank_m2
 from hsi_sc_nerf.analysis.change_pictures import draw_change, draw_class_change
+from hsi_sc_nerf.analysis.change_regions import LIMIT_M2, LIMIT_PART, limit_of_blank_m2
 from hsi_sc_nerf.analysis.change_registration import Attitude
-from hsi_sc_nerf.analysis.change_report import change_rows, write_change_ply, write_tables
+from hsi_sc_nerf.analysis.change_report import change_rows, write_change_ply, write_change_tables
 from hsi_sc_nerf.analysis.library import SpectralLibrary
 from hsi_sc_nerf.analysis.pictures import SideViews
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
@@ -110,7 +110,7 @@ def test_the_limit_is_a_part_of_what_was_seen_and_at_least_an_area(first, alone)
 
 
 def test_page_table_and_cloud_tell_what_is_undecided(first, alone, tmp_path):
-    write_tables(tmp_path, alone, {}, {})
+    write_change_tables(tmp_path, alone, {}, {})
     page = (tmp_path / "change.md").read_text()
     assert "up to 1.4 cm² that are no change (limit of blank)" in page
     assert (
@@ -125,7 +125,7 @@ def test_page_table_and_cloud_tell_what_is_undecided(first, alone, tmp_path):
     assert set(np.unique(region)) == {-2.0, 0.0, 1.0}
 
     repeat = day(3)
-    write_tables(tmp_path, compared(first, day(1, spot(SMALL_M)), repeat=repeat), {}, {}, repeat)
+    write_change_tables(tmp_path, compared(first, day(1, spot(SMALL_M)), repeat=repeat), {}, {}, repeat)
     assert "limit of blank" not in (tmp_path / "change.md").read_text()
     assert json.loads((tmp_path / "change.json").read_text())["days"][0]["limit_of_blank_m2"] is None
 
@@ -145,7 +145,7 @@ def test_undecided_regions_are_striped_in_the_picture(first, alone, tmp_path, mo
 def test_maps_of_classes_differ_where_a_region_counts(first, alone, tmp_path, monkeypatch):
     """And not where it is undecided; mesh and picture show the same."""
     (one,) = alone
-    write_tables(tmp_path, alone, {}, {})
+    write_change_tables(tmp_path, alone, {}, {})
     assert json.loads((tmp_path / "change.json").read_text())["classes"] == ["skin", "bruise"]
     write_change_ply(tmp_path / "change.ply", first, alone)
     columns, seen = read_spectral_ply(tmp_path / "change.ply").extra, first.surface.seen

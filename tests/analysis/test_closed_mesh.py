@@ -27,16 +27,16 @@ SPECK = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
 def test_thinning_leaves_one_mean_a_cell():
     points = np.array([[0.0, 0.0, 0.0], [0.002, 0.0, 0.0], [0.015, 0.0, 0.0]])
     normals = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
-    places, sides = thinned(points, normals, 0.01)
-    np.testing.assert_allclose(places, [[0.001, 0.0, 0.0], [0.015, 0.0, 0.0]])
+    found, sides = thinned(points, normals, 0.01)
+    np.testing.assert_allclose(found, [[0.001, 0.0, 0.0], [0.015, 0.0, 0.0]])
     np.testing.assert_allclose(sides, [[0.0, 0.5, 0.5], [1.0, 0.0, 0.0]])
 
 
 def test_smoothing_takes_noise_away_and_keeps_a_curved_surface():
     points, normals = sphere_points(8000, noise_m=0.0003)
     noisy = normals + np.random.default_rng(1).standard_normal(normals.shape)
-    places, outward = smoothed(points, noisy, 0.004)
-    offset = places - [0.0, 0.0, STAND_M + RADIUS_M]
+    found, outward = smoothed(points, noisy, 0.004)
+    offset = found - [0.0, 0.0, STAND_M + RADIUS_M]
     radius = np.linalg.norm(offset, axis=1)
     assert radius.std() < 0.00012
     assert radius.mean() == pytest.approx(RADIUS_M, abs=3e-5)
@@ -47,8 +47,8 @@ def test_smoothing_keeps_a_quadric_exactly():
     x, y = (grid.ravel() for grid in np.meshgrid(*[np.linspace(-0.01, 0.01, 41)] * 2))
     points = np.stack([x, y, 8.0 * x**2 - 5.0 * x * y + 2.0 * y**2], axis=-1)
     middle = np.flatnonzero(np.hypot(x, y) < 1e-9)
-    places, outward = smoothed(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), 0.002)
-    np.testing.assert_allclose(places[middle], 0.0, atol=1e-7)
+    found, outward = smoothed(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), 0.002)
+    np.testing.assert_allclose(found[middle], 0.0, atol=1e-7)
     np.testing.assert_allclose(outward[middle], [[0.0, 0.0, 1.0]], atol=1e-5)
 
 

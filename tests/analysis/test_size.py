@@ -10,15 +10,15 @@ from standing_sphere import RADIUS_M, STAND_M, sphere_points
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh
 from hsi_sc_nerf.analysis.size import (
     SURFACE_PX,
-    SharedErrors,
     Size,
+    SystematicErrors,
     combined,
     offset,
     scale_uncertainty,
-    shared_errors,
     size_of,
     size_uncertainty,
     sizes_to_find,
+    systematic_errors,
 )
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
@@ -27,8 +27,8 @@ from hsi_sc_nerf.packed.dataset import open_packed
 CONFIG = MeshConfig(octree_depth=5, smoothing_radius_m=0.003, base_height_m=STAND_M)
 
 
-def uncertainty(cloud, config=CONFIG, splits=0, shared=None, done=None):
-    return size_uncertainty(*cloud, closed_mesh(*cloud, config), config, splits, shared, done)
+def uncertainty(cloud, config=CONFIG, splits=0, systematic=None, done=None):
+    return size_uncertainty(*cloud, closed_mesh(*cloud, config), config, splits, systematic, done)
 
 
 @pytest.mark.slow
@@ -44,10 +44,10 @@ def test_scatter_from_halves_is_that_of_independent_clouds():
 
 @pytest.mark.slow
 def test_what_points_share_changes_a_sphere_as_calculus_says():
-    shared = SharedErrors(scale=0.01, surface_m=0.0003, base_m=0.001)
+    systematic = SystematicErrors(scale=0.01, surface_m=0.0003, base_m=0.001)
     told = []
-    parts = uncertainty(sphere_points(6000, above=-0.93), shared=shared, done=told.append)
-    assert told[-1] == sizes_to_find(0, shared)
+    parts = uncertainty(sphere_points(6000, above=-0.93), systematic=systematic, done=told.append)
+    assert told[-1] == sizes_to_find(0, systematic)
     area_m2, volume_l = 4 * np.pi * RADIUS_M**2, 4000 * np.pi * RADIUS_M**3 / 3
     assert parts["scale"].area_m2 == pytest.approx(0.02 * area_m2, rel=0.02)
     assert parts["scale"].volume_l == pytest.approx(0.03 * volume_l, rel=0.02)
@@ -93,12 +93,12 @@ def test_a_dataset_tells_scale_and_pixels(tmp_path):
     dataset = open_packed(write_ball_dataset(tmp_path))
     eye_m = dataset.frames[0].camera_to_world[:3, 3]
     pixel_m = np.linalg.norm(eye_m - dataset.object_box_m.mean(axis=0)) / dataset.intrinsics.fl_x
-    known, unknown = (shared_errors(dataset, base_known=known) for known in (True, False))
+    known, unknown = (systematic_errors(dataset, base_known=known) for known in (True, False))
     assert known.scale == 0.0
     assert known.surface_m == pytest.approx(SURFACE_PX * pixel_m, rel=0.02)
     assert unknown.base_m > known.base_m
     write_json(dataset.root / "poses.json", {"scale": {"uncertainty_percent": 0.5}})
-    assert shared_errors(dataset, base_known=True).scale == pytest.approx(0.005)
+    assert systematic_errors(dataset, base_known=True).scale == pytest.approx(0.005)
 
 
 @pytest.mark.parametrize(

@@ -21,13 +21,13 @@ from hsi_sc_nerf.analysis.measurement_files import write_spectra
 from hsi_sc_nerf.analysis.pictures import SideViews
 from hsi_sc_nerf.analysis.report import trait_tables
 from hsi_sc_nerf.analysis.size import Size
-from hsi_sc_nerf.analysis.spectral_mesh import LitSpectra, SpectralMesh, with_spectra, write_mesh
+from hsi_sc_nerf.analysis.spectral_mesh import LitSpectra, SpectralMesh, with_spectra, write_spectral_mesh
 from hsi_sc_nerf.analysis.traits import (
     WHOLE,
     RegionOfInterest,
     analyse,
     classified,
-    mean_and_sd,
+    weighted_mean_and_sd,
 )
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import (
@@ -154,10 +154,10 @@ def test_means_are_weighted_by_area():
 
 
 def test_mean_and_sd_against_repeated_values():
-    found = mean_and_sd(np.array([[1.0, 2.0], [3.0, np.nan], [5.0, 4.0]]), np.array([1.0, 2.0, 1.0]))
+    found = weighted_mean_and_sd(np.array([[1.0, 2.0], [3.0, np.nan], [5.0, 4.0]]), np.array([1.0, 2.0, 1.0]))
     np.testing.assert_allclose(found.mean, [np.mean([1, 3, 3, 5]), 3.0])
     np.testing.assert_allclose(found.sd, [np.std([1, 3, 3, 5]), 1.0])
-    assert np.isnan(mean_and_sd(np.array([np.nan]), np.array([1.0])).mean)
+    assert np.isnan(weighted_mean_and_sd(np.array([np.nan]), np.array([1.0])).mean)
 
 
 def test_vertices_take_the_spectra_of_points_near_them():
@@ -221,7 +221,7 @@ def test_a_cloud_by_material_gives_both_reflectances(tmp_path):
     assert low.light.irradiance.mean == pytest.approx(0.5, abs=1e-3)
     # What the region's points share does not shrink with their number.
     assert low.light.irradiance_std == pytest.approx(0.03)
-    write_mesh(tmp_path / "mesh.ply", found, {})
+    write_spectral_mesh(tmp_path / "mesh.ply", found, {})
     read = read_spectral_ply(tmp_path / "mesh.ply")
     np.testing.assert_allclose(read.spectra, found.lit.measured)
     np.testing.assert_allclose(material_spectra(read), found.spectra)
@@ -255,7 +255,7 @@ def test_mesh_is_a_cloud_with_triangles(tmp_path, bands):
 
     surface = two_halves()
     surface = replace(surface, spectra=surface.spectra[:, bands], wavelengths_nm=NM[bands])
-    write_mesh(tmp_path / "mesh.ply", surface, {"class": np.ones(len(surface.seen))})
+    write_spectral_mesh(tmp_path / "mesh.ply", surface, {"class": np.ones(len(surface.seen))})
     read = read_spectral_ply(tmp_path / "mesh.ply")
     np.testing.assert_allclose(read.spectra, surface.spectra)
     assert sorted(read.extra) == ["class", "seen"]

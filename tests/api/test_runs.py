@@ -15,7 +15,6 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import read_spectral_ply
 from hsi_sc_nerf.export.options import CloudOptions
 from hsi_sc_nerf.export.spectral_export import export_cloud
-from hsi_sc_nerf.models import trained_run
 
 
 @pytest.fixture(scope="module")
@@ -61,9 +60,8 @@ def test_points_have_the_spectrum_of_the_ball_and_points_beside_it_none(run, mon
 
 
 @pytest.mark.slow
-def test_a_frame_is_rendered_as_the_command_renders_it(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(trained_run, "open_run", lambda _: run.trained)
-    RenderCommand(tmp_path / "config.yml", tmp_path / "command").main()
+def test_a_frame_is_rendered_as_the_command_renders_it(run, tmp_path):
+    RenderCommand(tmp_path / "config.yml", tmp_path / "command").main(run.trained)
     (name,) = (path.stem for path in (tmp_path / "command").glob("ball_?.hdr"))
     view = run.render(name)
     header = view.save(tmp_path / "own")

@@ -18,7 +18,6 @@ from quick_steps import quick_snakefile
 from hsi_sc_nerf.batch.plan import STEPS
 from hsi_sc_nerf.cli import batch
 from hsi_sc_nerf.cli.batch import SNAKEFILE, BatchCommand
-from hsi_sc_nerf.cli.main import main
 from hsi_sc_nerf.errors import InputError
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "batch.md"
@@ -98,20 +97,19 @@ def test_each_step_states_what_the_page_says_that_it_needs():
     assert list(told) == list(STEPS)
 
 
-def test_words_of_snakemake_reach_it_unchanged_after_ours(tmp_path, monkeypatch):
+def test_words_of_snakemake_reach_it_unchanged_after_ours(tmp_path, monkeypatch, command):
     found = []
     monkeypatch.setattr(batch, "_snakemake", lambda given: found.append(given) or 0)
     make_sessions(tmp_path / "sessions", ["a"])
     for more in (["--retries", "2"], ["--executor", "slurm", "--jobs", "50"], ["--profile=kubernetes"]):
-        monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", *words(tmp_path, *more), "--gpu"])
-        main()
+        assert command(*words(tmp_path, *more), "--gpu") == 0
         assert found[-1][-3 - len(more) :] == ["objects", "--cores", "1", *more]
         assert "gpu=True" in found[-1]
     # How much may run at once is this machine's affair only where the jobs run there.
     assert ["all" in one for one in found] == [True, False, False]
 
 
-def test_two_started_at_once_do_not_harm_each_other(tmp_path, monkeypatch):
+def test_two_started_at_once_do_not_harm_each_other(tmp_path, monkeypatch, command):
     """The second comes before Snakemake of the first has its lock: it is refused, and the list stays the first's."""
     out = tmp_path / "out"
     for name in ("first", "second"):
@@ -121,17 +119,12 @@ def test_two_started_at_once_do_not_harm_each_other(tmp_path, monkeypatch):
     def snakemake(given):
         before = files(out)
         for more in ([], ["--preset", "best"], ["--dry-run"]):
-            monkeypatch.setattr(
-                sys, "argv", ["hsi-sc-nerf", *words(tmp_path / "second", *more), "--output-dir", str(out)]
-            )
-            with pytest.raises(SystemExit):
-                main()
+            assert command(*words(tmp_path / "second", *more), "--output-dir", out) == 2
             refused.append(files(out) == before)
         return 0
 
     monkeypatch.setattr(batch, "_snakemake", snakemake)
-    monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", *words(tmp_path / "first"), "--output-dir", str(out)])
-    main()
+    assert command(*words(tmp_path / "first"), "--output-dir", out) == 0
     assert refused == [True, True, True]
     assert "first" in (out / "sessions.csv").read_text()
     assert not list(out.rglob("*.lock"))
@@ -150,7 +143,7 @@ def test_what_is_refused_leaves_no_lock_and_no_folder(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_six_sessions_of_which_two_fail(tmp_path, monkeypatch, capfd):
+def test_six_sessions_of_which_two_fail(tmp_path, monkeypatch, command, capfd):
     """First the plan; then all; then nothing; then what was mended; then what was asked for."""
     pytest.importorskip("snakemake")
     names = ["apple", "broken", "maize", "pear", "pepper", "unmarked"]
@@ -160,8 +153,7 @@ def test_six_sessions_of_which_two_fail(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(batch, "SNAKEFILE", quick_snakefile(tmp_path))
 
     def do(*more):
-        monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", *words(tmp_path, *more)])
-        main()
+        assert command(*words(tmp_path, *more)) == 0
         return capfd.readouterr()
 
     told = do("--dry-run")

@@ -114,14 +114,14 @@ def test_files_hold_the_attitudes_the_maps_and_the_film(written):
 @pytest.mark.slow
 def test_a_trained_run_without_a_cloud_is_sampled_and_left_as_it_is(tmp_path, monkeypatch):
     config = ball_run.write_untrained_run(ball_run.write_ball_dataset(tmp_path / "data"), tmp_path / "runs")
-    opened = trained_run.open_run
+    opened = trained_run.open_trained_run
 
     def open_ball(path):
         run = opened(path)
         ball_run.fill_with_ball(run)
         return run
 
-    monkeypatch.setattr(trained_run, "open_run", open_ball)
+    monkeypatch.setattr(trained_run, "open_trained_run", open_ball)
     monkeypatch.setattr(change, "POINTS", 3000)
     before = sorted(config.parent.rglob("*"))
     cloud = change._read(change._file_of(config.parent))

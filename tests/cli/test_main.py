@@ -11,7 +11,6 @@ from pathlib import Path
 import pressed_at_import
 import pytest
 
-from hsi_sc_nerf.cli import main as entry
 from hsi_sc_nerf.cli.main import COMMANDS
 from hsi_sc_nerf.cli.sessions import MarkersCommand
 from hsi_sc_nerf.errors import InputError
@@ -30,46 +29,39 @@ def start(words):
     )
 
 
-def test_a_file_that_the_system_refuses_is_one_line(monkeypatch, capsys):
+def test_a_file_that_the_system_refuses_is_one_line(monkeypatch, capsys, command):
     def refused(self):
         Path("/" + "a" * 300).read_bytes()
 
     monkeypatch.setattr(MarkersCommand, "main", refused)
-    monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", "markers"])
-    with pytest.raises(SystemExit) as ended:
-        entry.main()
-    assert ended.value.code == 2
+    assert command("markers") == 2
     told = capsys.readouterr().err
     assert told.startswith("Error: /aaa")
     assert told.count("\n") == 1
 
 
-def test_a_sentence_of_what_opens_runs_is_told_as_any_other(monkeypatch, capsys):
+def test_a_sentence_of_what_opens_runs_is_told_as_any_other(monkeypatch, capsys, command):
     """Data and model are nerfstudio's parts, which end its commands as well."""
 
     def refused(self):
         raise SystemExit("hsi-sc-nerf: cubes/a.hdr: is missing; process again.")
 
     monkeypatch.setattr(MarkersCommand, "main", refused)
-    monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", "markers"])
-    with pytest.raises(SystemExit) as ended:
-        entry.main()
-    assert ended.value.code == 2
+    assert command("markers") == 2
     assert capsys.readouterr().err == "Error: cubes/a.hdr: is missing; process again.\n"
 
 
-def test_an_error_that_is_no_file_is_not_hidden(monkeypatch):
+def test_an_error_that_is_no_file_is_not_hidden(monkeypatch, command):
     def broken(self):
         raise OSError("no file is named")
 
     monkeypatch.setattr(MarkersCommand, "main", broken)
-    monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", "markers"])
     with pytest.raises(OSError, match="no file is named"):
-        entry.main()
+        command("markers")
 
 
 @pytest.mark.parametrize("other", [ImportError("a library failed to import"), InputError("a: is damaged.")])
-def test_ctrl_c_that_a_library_turned_into_an_error_is_the_same_line(monkeypatch, capsys, other):
+def test_ctrl_c_that_a_library_turned_into_an_error_is_the_same_line(monkeypatch, capsys, command, other):
     def interrupted(self):
         try:
             signal.raise_signal(signal.SIGINT)
@@ -78,26 +70,21 @@ def test_ctrl_c_that_a_library_turned_into_an_error_is_the_same_line(monkeypatch
 
     monkeypatch.setattr(MarkersCommand, "main", interrupted)
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", "markers"])
-    with pytest.raises(SystemExit) as ended:
-        entry.main()
-    assert ended.value.code == 130
+    assert command("markers") == 130
     assert capsys.readouterr() == ("", "Stopped.\n")
 
 
-def test_ctrl_c_after_all_is_done_changes_nothing(monkeypatch, capsys):
+def test_ctrl_c_after_all_is_done_changes_nothing(monkeypatch, capsys, command):
     monkeypatch.setattr(MarkersCommand, "main", lambda self: None)
-    monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", "markers"])
-    entry.main()
+    assert command("markers") == 0
     signal.raise_signal(signal.SIGINT)
     assert capsys.readouterr() == ("", "")
 
 
-def test_a_command_that_ignores_ctrl_c_from_its_start_goes_on_ignoring_it(monkeypatch):
+def test_a_command_that_ignores_ctrl_c_from_its_start_goes_on_ignoring_it(monkeypatch, command):
     monkeypatch.setattr(MarkersCommand, "main", lambda self: signal.raise_signal(signal.SIGINT))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # as nohup has it
-    monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", "markers"])
-    entry.main()
+    assert command("markers") == 0
 
 
 @pytest.mark.slow

@@ -98,9 +98,9 @@ def test_scores_need_no_open3d() -> None:
 
 
 def on_square(count: int, seed: int = 0) -> np.ndarray:
-    places = np.random.default_rng(seed).uniform(0.01, 0.09, (count, 3))
-    places[:, 2] = 0
-    return places
+    positions = np.random.default_rng(seed).uniform(0.01, 0.09, (count, 3))
+    positions[:, 2] = 0
+    return positions
 
 
 def distances(cloud: Surface, reference: Surface) -> tuple[np.ndarray, np.ndarray]:

@@ -1,10 +1,8 @@
-import sys
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from hsi_sc_nerf.cli.main import main
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import OUTLIER_NEIGHBOURS, statistical_inliers
 from hsi_sc_nerf.export.options import CloudOptions, select_bands
@@ -41,12 +39,9 @@ def test_bands_that_are_not_there(word: str, message: str) -> None:
         ([], "config.yml: there is no such file"),
     ],
 )
-def test_bad_input_on_the_command_line_is_one_sentence(monkeypatch, capsys, tmp_path, words, message) -> None:
+def test_bad_input_on_the_command_line_is_one_sentence(command, capsys, tmp_path, words, message) -> None:
     given = ["export", "--load-config", str(tmp_path / "config.yml"), "--output-dir", str(tmp_path), *words]
-    monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", *given])
-    with pytest.raises(SystemExit) as caught:
-        main()
-    assert caught.value.code == 2
+    assert command(*given) == 2
     last_line = capsys.readouterr().err.splitlines()[-1]
     assert last_line.startswith("Error: ")
     assert message in last_line

@@ -16,7 +16,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.comparison import read_surface
 from hsi_sc_nerf.export.cloud import material_spectra, read_spectral_ply, write_spectral_ply
 from hsi_sc_nerf.export.sample_points import frontal_views, outward_normals, read_points
-from hsi_sc_nerf.models import trained_run
+from hsi_sc_nerf.models.trained_run import open_trained_run
 
 
 def test_frontal_views_are_the_largest_cosines_in_the_frame():
@@ -47,17 +47,15 @@ def run_config(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def run(run_config):
-    opened = trained_run.open_run(run_config)
+    opened = open_trained_run(run_config)
     ball_run.fill_with_ball(opened)
     return opened
 
 
 @pytest.fixture
-def sample(run, monkeypatch):
-    monkeypatch.setattr(trained_run, "open_run", lambda _: run)
-
+def sample(run):
     def sample(path, **options):
-        SampleCommand(path, load_config=Path("runs/ball/now/config.yml"), **options).main()
+        SampleCommand(path, load_config=Path("runs/ball/now/config.yml"), **options).main(run)
         return path.with_name(f"{path.stem}-spectral.ply")
 
     return sample
@@ -231,21 +229,21 @@ def test_odd_faces_are_refused_in_a_sentence(tmp_path, faces, told):
 
 def test_what_is_no_run_is_refused_in_a_sentence(tmp_path, run_config):
     with pytest.raises(InputError, match="there is no such file"):
-        trained_run.open_run(tmp_path / "config.yml")
+        open_trained_run(tmp_path / "config.yml")
     other = tmp_path / "config.yml"
     other.write_text("a: 1\n")
     with pytest.raises(InputError, match=r"config\.yml: .*give the config\.yml of a run"):
-        trained_run.open_run(other)
+        open_trained_run(other)
     alone = tmp_path / "alone.yml"
     alone.write_text(run_config.read_text())
     with pytest.raises(InputError, match="checkpoint"):
-        trained_run.open_run(alone)
+        open_trained_run(alone)
 
 
 def test_a_run_that_was_moved_is_opened_from_anywhere(tmp_path, run_config, run, monkeypatch):
     moved = shutil.copytree(run_config.parent, tmp_path / "archive" / "apple 7")
     monkeypatch.chdir(moved)
-    opened = trained_run.open_run(Path("config.yml"))
+    opened = open_trained_run(Path("config.yml"))
     for name, value in run.model.state_dict().items():
         if not name.endswith("grid.opacity"):  # which follows the ball in the one
             torch.testing.assert_close(opened.model.state_dict()[name], value)
@@ -258,7 +256,7 @@ def test_a_dataset_given_relative_to_another_folder_is_found_above_the_run(tmp_p
     relative = run_config.with_name("relative.yml")
     relative.write_text(yaml.dump(config))
     monkeypatch.chdir(tmp_path)
-    assert trained_run.open_run(relative).dataset.root.resolve() == (home / "data").resolve()
+    assert open_trained_run(relative).dataset.root.resolve() == (home / "data").resolve()
 
 
 def test_metres_and_scene_units_are_inverse(run):

@@ -1,5 +1,7 @@
 """The surface of a ball that a model knows exactly: found, spread over evenly, seen by the right frames."""
 
+from functools import partial
+
 import cv2
 import numpy as np
 import pytest
@@ -8,10 +10,12 @@ from known_ball import FRAMES, LENS, POSES, RADIUS, SIZE_PX, WAVELENGTHS_NM, Bal
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.spatial import sample_surface
+from hsi_sc_nerf.export import formats, spectral_export
 from hsi_sc_nerf.export.cloud import read_spectral_ply
 from hsi_sc_nerf.export.options import CloudOptions
 from hsi_sc_nerf.export.spectral_export import export_cloud
 from hsi_sc_nerf.geometry.camera import project
+from hsi_sc_nerf.surface import surface_points as sampling
 from hsi_sc_nerf.surface.depth_renders import refined_poses, render_depth_maps
 from hsi_sc_nerf.surface.surface_depth import MIN_COSINE, SEARCH_DEPTH, SEARCH_STEPS, camera_rays, render_object
 from hsi_sc_nerf.surface.surface_points import sample_surface_points
@@ -141,7 +145,7 @@ def tried(monkeypatch):
         counts.append(count)
         return sample_surface(vertices, triangles, count, seed)
 
-    monkeypatch.setattr("hsi_sc_nerf.surface.surface_points.sample_surface", counted)
+    monkeypatch.setattr(sampling, "sample_surface", counted)
     return counts
 
 
@@ -155,8 +159,8 @@ def test_a_small_region_is_searched_only_near_it(run, tmp_path, tried):
 
 
 def test_a_region_with_hardly_any_surface_gives_what_it_has(run, tmp_path, tried, monkeypatch, capsys):
-    monkeypatch.setattr("hsi_sc_nerf.surface.surface_points._MAX_BATCH", 2000)
-    monkeypatch.setattr("hsi_sc_nerf.surface.surface_points._MAX_CANDIDATES", 1)
+    searched = partial(sampling.even_points, max_batch=2000, max_candidates=1)
+    monkeypatch.setattr(sampling, "even_points", searched)
     box = (0.05, -0.0215, 0.0585, 0.07, -0.0185, 0.0615)
     options = CloudOptions(num_points=2000, roi_box=box, remove_outliers=False)
     count = len(read_spectral_ply(export_cloud(run, tmp_path, options)))
@@ -169,19 +173,17 @@ def test_a_few_points_are_no_outliers_and_a_cloud_is_never_empty(run, tmp_path, 
     path = export_cloud(run, tmp_path / "[bold]", CloudOptions(num_points=2))
     assert len(read_spectral_ply(path)) == 2
     assert str(path) in capsys.readouterr().out
-    monkeypatch.setattr("hsi_sc_nerf.export.spectral_export.statistical_inliers", lambda *_: np.zeros(0, int))
+    monkeypatch.setattr(spectral_export, "statistical_inliers", lambda *_: np.zeros(0, int))
     with pytest.raises(InputError, match="every point counts as an outlier"):
         export_cloud(run, tmp_path / "none", CloudOptions(num_points=100))
     assert not (tmp_path / "none").exists()
 
 
 def test_clouds_that_cannot_be_written_are_refused_before_rendering(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "hsi_sc_nerf.export.spectral_export.render_depth_maps", lambda *_: pytest.fail("the model was rendered")
-    )
+    monkeypatch.setattr(spectral_export, "render_depth_maps", lambda *_: pytest.fail("the model was rendered"))
     with pytest.raises(InputError, match="holds no mask of a training frame"):
         export_cloud(run, tmp_path, CloudOptions(roi_masks=tmp_path))
-    monkeypatch.setattr("hsi_sc_nerf.export.formats.LAS_MAX_DIMENSIONS", 10)
+    monkeypatch.setattr(formats, "LAS_MAX_DIMENSIONS", 10)
     (tmp_path / "point_cloud.zarr").mkdir()
     for file_format, message in (("las", "LAS has room for 2 bands"), ("zarr", "is not a Zarr folder")):
         pytest.importorskip({"las": "laspy"}.get(file_format, file_format))

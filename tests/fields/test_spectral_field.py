@@ -120,7 +120,7 @@ def test_the_box_ends_the_scene_unless_space_is_contracted(reach):
 def test_spectra_depend_on_the_view_only_where_they_may():
     along, back = rays(samples=1), rays(samples=1)
     back.frustums.directions = -back.frustums.directions
-    # The same places seen from the other side.
+    # The same positions seen from the other side.
     back.frustums.origins = along.frustums.get_positions() - back.frustums.directions * (
         (back.frustums.starts + back.frustums.ends) / 2.0
     )

@@ -6,7 +6,14 @@ import trimesh
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.geometry.mesh import Mesh
-from hsi_sc_nerf.light.elements import MISPLACED_PX, Elements, observe, shown_points, spread_elements, support_mesh
+from hsi_sc_nerf.light.elements import (
+    MISPLACED_PX,
+    Elements,
+    observe_elements,
+    shown_points,
+    spread_elements,
+    support_mesh,
+)
 from hsi_sc_nerf.light.stationary_light import even_directions
 from hsi_sc_nerf.light.views import Transfer, transfer
 
@@ -103,13 +110,13 @@ def test_measurements_are_uncertain_where_brightness_changes_from_pixel_to_pixel
     half = SIZE / 2 * PIXEL_M
     corners = half * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
     plane = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
-    places = np.random.default_rng(0).uniform(-0.8 * half, 0.8 * half, (400, 2))
-    positions, normals = np.pad(places, ((0, 0), (0, 1))), np.tile([0.0, 0.0, 1.0], (400, 1))
+    across = np.random.default_rng(0).uniform(-0.8 * half, 0.8 * half, (400, 2))
+    positions, normals = np.pad(across, ((0, 0), (0, 1))), np.tile([0.0, 0.0, 1.0], (400, 1))
     elements = Elements(positions, normals, np.ones(400, bool), plane, np.zeros(2, int))
     pose = np.eye(4)
     pose[2, 3] = DISTANCE_M
     focal = DISTANCE_M / PIXEL_M
-    views = observe(
+    views = observe_elements(
         elements,
         pose[None],
         PinholeIntrinsics(SIZE, SIZE, focal, focal, SIZE / 2, SIZE / 2),

@@ -60,8 +60,8 @@ def test_a_lamp_has_its_own_colour(ball):
 
 @pytest.mark.slow
 def test_a_near_lamp_is_found_to_be_near():
-    places_m = np.random.default_rng(3).uniform(-0.06, 0.06, (300, 3))
-    parts = turning_ball(places_m=places_m)
+    centres_m = np.random.default_rng(3).uniform(-0.06, 0.06, (300, 3))
+    parts = turning_ball(centres_m=centres_m)
     for distance_m in (3.0, 0.5):
         views, _, material = measured(parts, 0.5, noise=0.002, distance_m=distance_m)
         found = fit_light(parts, views, FACING)

@@ -9,7 +9,7 @@ import pytest
 from light_on_a_ball import FACING, measured, turning_ball
 from random_cloud import random_cloud
 
-from hsi_sc_nerf.cli.light import sentences, summary
+from hsi_sc_nerf.cli.light import light_summary, sentences
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.spatial import sample_surface
 from hsi_sc_nerf.export.cloud import SpectralCloud, read_spectral_ply, stream
@@ -18,7 +18,7 @@ from hsi_sc_nerf.export.formats import write_cloud
 from hsi_sc_nerf.geometry.camera import pixel_rays
 from hsi_sc_nerf.light.fit import fit_light
 from hsi_sc_nerf.light.of_run import light_of_run, shading_evidence
-from hsi_sc_nerf.models.trained_run import open_run
+from hsi_sc_nerf.models.trained_run import open_trained_run
 from hsi_sc_nerf.packed.cube import pack, write_packed_cube
 from hsi_sc_nerf.packed.dataset import open_packed
 
@@ -47,7 +47,7 @@ def open_lit_ball(root, lit):
         reflectance = np.broadcast_to(factory.BACKGROUND, (*mask.shape, factory.BANDS)).copy()
         reflectance[mask] = factory.PLANT * irradiance(normals, frame.camera_to_world)[:, None]
         write_packed_cube(frame.cube_path, pack(reflectance), factory.WAVELENGTHS_NM)
-    run = open_run(ball_run.write_untrained_run(root / "data", root / "runs"))
+    run = open_trained_run(ball_run.write_untrained_run(root / "data", root / "runs"))
     ball_run.fill_with_ball(run)
     return run
 
@@ -97,7 +97,7 @@ def test_a_lamp_on_a_run_is_found_and_divided_out(lit):
     np.testing.assert_allclose(corrected.extra["irradiance_std"], std, rtol=1e-4)
     assert (std > 0.0).all()
     np.testing.assert_array_equal(corrected.spectra, cloud.spectra)
-    told = summary(lit, corrected, corrected=True)
+    told = light_summary(lit, corrected, corrected=True)
     assert told["shaded"] is True
     assert told["relative_std"] == pytest.approx(np.median(std / by_band.mean(axis=1)), rel=1e-4)
 
@@ -129,7 +129,7 @@ def test_files_hold_reflectance_as_measured_and_of_the_material(lit, tmp_path, f
 def test_shade_that_is_not_corrected_has_no_stated_uncertainty(lit):
     same = with_material(upper_cloud(lit, lit=True), lit, factory.WAVELENGTHS_NM, corrected=False)
     assert np.isnan(same.extra["irradiance_std"]).all()
-    assert summary(lit, same, corrected=False)["relative_std"] is None
+    assert light_summary(lit, same, corrected=False)["relative_std"] is None
 
 
 @pytest.mark.parametrize(

@@ -11,14 +11,14 @@ from small_trainer import trainer
 
 from hsi_sc_nerf.config import hsi_sc_nerf_paper
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.findings import Effect
+from hsi_sc_nerf.findings import EffectEvidence
 from hsi_sc_nerf.models.chosen_effects import MODEL_EFFECTS, chosen_effects, effects_setting, require_effects
 from hsi_sc_nerf.models.spectral_model import SpectralModelConfig
 from hsi_sc_nerf.packed.dataset import open_packed, write_transforms
 
 
 def effect(name, present):
-    return Effect(name, present, 2.0, 0.1, 1.0, "%", "A sentence.")
+    return EffectEvidence(name, present, 2.0, 0.1, 1.0, "%", "A sentence.")
 
 
 def with_effects(dataset, *present):
@@ -106,7 +106,7 @@ def test_a_run_keeps_its_effects_when_the_dataset_changes(tiny_dataset, tmp_path
 
 def test_effects_are_stored_and_read_back(tiny_dataset, tmp_path):
     data, _ = copied(tiny_dataset, tmp_path / "data", "view_dependence")
-    unknown = Effect("wobble", False, None, None, None, "-log10 p", "Not looked for.")
+    unknown = EffectEvidence("wobble", False, None, None, None, "-log10 p", "Not looked for.")
     dataset = replace(open_packed(data), effects=(effect("still_chamber", True), unknown))
     write_transforms(dataset)
     assert open_packed(data).effects == dataset.effects

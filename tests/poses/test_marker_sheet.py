@@ -1,10 +1,7 @@
-import sys
-
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from hsi_sc_nerf.cli.main import main
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.marker_detection import detect_markers
 from hsi_sc_nerf.poses.marker_sheet import PAPER_MM, RULER_MM, marker_sheets, write_marker_sheets
@@ -38,11 +35,10 @@ def test_printed_markers_are_detected_at_their_size(paper, side_m, dictionary, c
         assert corners[0, 1] < corners[3, 1]
 
 
-def test_the_command_writes_pages_of_the_papers_size(tmp_path, monkeypatch, capsys) -> None:
+def test_the_command_writes_pages_of_the_papers_size(tmp_path, command, capsys) -> None:
     path = tmp_path / "new" / "markers.pdf"
-    words = ["markers", "--output", str(path), "--marker-side-m", "0.08", "--count", "5"]
-    monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", *words])
-    main()
+    words = ["markers", "--output", path, "--marker-side-m", "0.08", "--count", "5"]
+    assert command(*words) == 0
     content = path.read_bytes()
     assert content.startswith(b"%PDF")
     assert content.count(b"/MediaBox [ 0 0 595.27") == 3
@@ -70,9 +66,7 @@ def test_a_full_disk_is_one_sentence(tmp_path, limit_of_files) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_another_file_format_is_refused(tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(sys, "argv", ["hsi-sc-nerf", "markers", "--output", str(tmp_path / "markers.png")])
-    with pytest.raises(SystemExit):
-        main()
+def test_another_file_format_is_refused(tmp_path, command, capsys) -> None:
+    assert command("markers", "--output", tmp_path / "markers.png") == 2
     assert "ends with .pdf" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

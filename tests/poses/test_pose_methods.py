@@ -10,7 +10,7 @@ from exact_turntable import pose_errors
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, rotation_about_z
-from hsi_sc_nerf.poses.feature_poses import KnownCamera, poses_from_features
+from hsi_sc_nerf.poses.feature_poses import KnownCamera, poses_from_sfm
 from hsi_sc_nerf.poses.pose_methods import find_poses
 from hsi_sc_nerf.poses.report import describe_poses, pose_report
 from hsi_sc_nerf.poses.result import Scale
@@ -51,7 +51,7 @@ def pear_info(**values):
 @pytest.mark.parametrize(("method", "largest_deg", "largest_mm"), [("auto", 0.1, 0.5), ("colmap", 0.2, 1.0)])
 def test_markers_give_the_poses_and_help_features(pear, free, method, largest_deg, largest_mm):
     images, names, truth, intrinsics = pear
-    poses = find_poses(images, names, pear_info(), method, from_features=partial(poses_from_features, free=free))
+    poses = find_poses(images, names, pear_info(), method, from_sfm=partial(poses_from_sfm, free=free))
     assert poses.method == {"auto": "markers"}.get(method, method)
     assert poses.metric
     assert poses.used.all()
@@ -75,7 +75,7 @@ def test_without_markers_and_a_known_distance_there_is_no_scale(pear, free):
         camera_distance_m=float(np.linalg.norm(truth[0, :2, 3])),
     )
     unknown = replace(by_hand, camera_distance_m=None)
-    options = {"method": "angles", "from_features": partial(poses_from_features, free=few)}
+    options = {"method": "angles", "from_sfm": partial(poses_from_sfm, free=few)}
     metric, unscaled = (find_poses(images, names, info, **options) for info in (by_hand, unknown))
     assert metric.method == "angles"
     np.testing.assert_allclose(metric.angles_deg, np.arange(FRAMES) * 360.0 / FRAMES, atol=1e-6)
@@ -102,11 +102,11 @@ STEPS = SessionInfo(nominal_step_deg=90.0)
 
 
 def test_auto_says_why_not():
-    poses = find_poses(BLANK, list("abcd"), STEPS, camera=CAMERA, from_markers=fails, from_features=fails)
+    poses = find_poses(BLANK, list("abcd"), STEPS, camera=CAMERA, from_markers=fails, from_sfm=fails)
     assert poses.method == "angles"
     assert poses.chosen == "by known angles (not by markers: it fails; nor by features (COLMAP): it fails)"
     with pytest.raises(InputError, match="markers: it fails; features"):
-        find_poses(BLANK, list("abcd"), STEPS, from_markers=fails, from_features=fails)
+        find_poses(BLANK, list("abcd"), STEPS, from_markers=fails, from_sfm=fails)
 
 
 @pytest.mark.parametrize(
@@ -143,7 +143,7 @@ def test_a_camera_that_no_one_has_is_not_believed():
     poses = find_poses(BLANK, list("abcd"), STEPS, "angles", camera=CAMERA)
     for focal_px, believed in ((100.0, True), (5000.0, False), (10.0, False)):
         found = replace(poses, intrinsics=replace(CAMERA.intrinsics, fl_x=focal_px, fl_y=focal_px))
-        options = {"method": "colmap", "from_features": lambda *_, found=found, **__: found}
+        options = {"method": "colmap", "from_sfm": lambda *_, found=found, **__: found}
         if believed:
             assert find_poses(BLANK, list("abcd"), SessionInfo(), **options).intrinsics.fl_x == focal_px
             continue

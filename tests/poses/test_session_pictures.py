@@ -21,7 +21,7 @@ from hsi_sc_nerf.geometry.camera import project
 from hsi_sc_nerf.packed.cube import FLAGGED, PixelFlag, pack, unpack, write_packed_cube
 from hsi_sc_nerf.poses.feature_poses import KnownCamera
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
-from hsi_sc_nerf.poses.marker_observations import observe, observe_expected
+from hsi_sc_nerf.poses.marker_observations import observe_expected, observe_markers
 from hsi_sc_nerf.poses.session_pictures import (
     BAND_GROUPS_NM,
     GRAY,
@@ -180,7 +180,7 @@ def test_the_best_picture_is_sharp_quiet_and_well_exposed(pear, tmp_path, kinds,
     for frame in frames:
         assert frame.ranking[0] in best
         assert all(frame.scores[name] < 0.75 * frame.scores[frame.ranking[0]] for name in worse)
-    found = observe(SessionPictures(frames), DICTIONARY).observations
+    found = observe_markers(SessionPictures(frames), DICTIONARY).observations
     assert len(found) >= 15
     true = np.array([truth[i][m] for i, m in zip(found.frame, found.marker, strict=True)])
     assert np.sqrt(np.mean((found.corners_px - true) ** 2)) < 0.1
@@ -210,7 +210,7 @@ def test_few_markers_in_the_best_picture_are_joined_by_those_of_the_others(machi
     for image in glare:
         image[:, 56:] = 100
     alone, whole, joined = (
-        observe(SessionPictures.of(shown), DICTIONARY).observations
+        observe_markers(SessionPictures.of(shown), DICTIONARY).observations
         for shown in (glare, images, two_pictures(glare, images))
     )
     assert len(alone) < len(whole) == len(joined)
@@ -225,7 +225,7 @@ def test_few_markers_in_the_best_picture_are_joined_by_those_of_the_others(machi
     first, again = np.array(taken).T
     np.testing.assert_allclose(joined.corners_px[again], alone.corners_px[first], atol=0.05)
     np.testing.assert_array_equal(
-        observe(two_pictures(blank, images), DICTIONARY).observations.corners_px, whole.corners_px
+        observe_markers(two_pictures(blank, images), DICTIONARY).observations.corners_px, whole.corners_px
     )
 
 
@@ -239,7 +239,7 @@ def test_ink_that_the_best_picture_does_not_show_is_found_in_the_broad_mean():
 @pytest.mark.slow
 def test_markers_that_were_not_detected_are_fitted_where_they_are_expected(machine):
     scene, images = machine
-    observed, true = observe(images, DICTIONARY), marker_turntable(scene)
+    observed, true = observe_markers(images, DICTIONARY), marker_turntable(scene)
     some = observed.observations.select(np.arange(len(observed.observations)) % 4 > 0)
     found = observe_expected(images, DICTIONARY, true, some, observed.blur_px)
     assert len(found) >= len(observed.observations)

@@ -67,9 +67,9 @@ def errors(found, truth):
     rotations = Rotation.from_matrix(true[:, :3, :3]) * Rotation.from_matrix(poses[:, :3, :3]).inv()
     turn = rotations.mean()
     rotation = np.rad2deg((rotations * turn.inv()).magnitude().max())
-    places = turn.apply(poses[:, :3, 3])
+    centres = turn.apply(poses[:, :3, 3])
     scale = np.linalg.norm(true[0, :2, 3])
-    off = scale * places - true[:, :3, 3]
+    off = scale * centres - true[:, :3, 3]
     return rotation, np.linalg.norm(off - off.mean(axis=0), axis=-1).max()
 
 

@@ -13,7 +13,7 @@ from hsi_sc_nerf.cli.trained_runs import RenderCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.geometry.camera import in_camera_frame, pixel_rays
-from hsi_sc_nerf.models import trained_run
+from hsi_sc_nerf.models.trained_run import open_trained_run
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.rendering.pictures import find_false_colour, open_video
 from hsi_sc_nerf.rendering.views import RenderedView, views_of_orbit, views_of_path, write_view
@@ -150,7 +150,7 @@ def test_what_cannot_be_rendered_is_refused_before_anything_is_loaded(tmp_path):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, dataset):
-    opened = trained_run.open_run(ball_run.write_untrained_run(dataset.root, tmp_path_factory.mktemp("runs")))
+    opened = open_trained_run(ball_run.write_untrained_run(dataset.root, tmp_path_factory.mktemp("runs")))
     ball_run.fill_with_ball(opened)
     return opened
 
@@ -164,9 +164,8 @@ def silhouette(pose, lens=factory.INTRINSICS):
 
 
 @pytest.mark.slow
-def test_a_ball_is_rendered_as_it_was_measured(tmp_path, run, monkeypatch):
-    monkeypatch.setattr(trained_run, "open_run", lambda _: run)
-    RenderCommand(tmp_path, tmp_path / "out", video=("pseudo-RGB",)).main()
+def test_a_ball_is_rendered_as_it_was_measured(tmp_path, run):
+    RenderCommand(tmp_path, tmp_path / "out", video=("pseudo-RGB",)).main(run)
     names = {path.name for path in (tmp_path / "out").iterdir()}
     of_view = {HELD_OUT + end for end in (".hdr", ".raw", ".png", "_valid.hdr", "_valid.raw")}
     assert names == of_view | {"render.md", "render.json", "held-out-pseudo-RGB.mp4"}
@@ -188,10 +187,9 @@ def test_a_ball_is_rendered_as_it_was_measured(tmp_path, run, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["float32", "uint16"])
-def test_views_of_the_material_show_the_cloud_that_tells_it(tmp_path, run, monkeypatch, kind):
-    monkeypatch.setattr(trained_run, "open_run", lambda _: run)
+def test_views_of_the_material_show_the_cloud_that_tells_it(tmp_path, run, kind):
     cloud = ball_run.write_material_cloud(tmp_path / "material.ply", material=factory.PLANT / 0.8)
-    RenderCommand(tmp_path, tmp_path / "out", material=cloud, cubes=kind).main()
+    RenderCommand(tmp_path, tmp_path / "out", material=cloud, cubes=kind).main(run)
     measured, found = (
         np.array(spectral.open_image(str(tmp_path / "out" / f"{HELD_OUT}{end}.hdr")).load())
         for end in ("", "_material")
@@ -203,8 +201,7 @@ def test_views_of_the_material_show_the_cloud_that_tells_it(tmp_path, run, monke
     assert (np.isnan(found[outside]) if kind == "float32" else found[outside] > 1.3).all()
 
 
-def test_an_orbit_of_another_size_without_cubes(tmp_path, run, monkeypatch):
-    monkeypatch.setattr(trained_run, "open_run", lambda _: run)
+def test_an_orbit_of_another_size_without_cubes(tmp_path, run):
     RenderCommand(
         tmp_path,
         tmp_path / "out",
@@ -213,7 +210,7 @@ def test_an_orbit_of_another_size_without_cubes(tmp_path, run, monkeypatch):
         orbit_size=0.5,
         cubes="none",
         video=("pseudo-RGB", "PSEUDO-rgb"),
-    ).main()
+    ).main(run)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         "render.md",
         "render.json",
@@ -227,7 +224,6 @@ def test_an_orbit_of_another_size_without_cubes(tmp_path, run, monkeypatch):
 def test_a_run_that_fails_leaves_no_video(tmp_path, run, monkeypatch):
     from hsi_sc_nerf.rendering import views as render_views
 
-    monkeypatch.setattr(trained_run, "open_run", lambda _: run)
     render_view, seen = render_views.render_view, []
 
     def fail_at_the_second(model, camera):
@@ -238,7 +234,9 @@ def test_a_run_that_fails_leaves_no_video(tmp_path, run, monkeypatch):
 
     monkeypatch.setattr(render_views, "render_view", fail_at_the_second)
     with pytest.raises(KeyboardInterrupt):
-        RenderCommand(tmp_path, tmp_path, views="orbit", orbit_views=3, orbit_size=0.3, video=("pseudo-RGB",)).main()
+        RenderCommand(tmp_path, tmp_path, views="orbit", orbit_views=3, orbit_size=0.3, video=("pseudo-RGB",)).main(
+            run
+        )
     assert {path.name for path in tmp_path.iterdir()} == {
         f"orbit_000{end}" for end in (".hdr", ".raw", "_valid.hdr", "_valid.raw")
     }

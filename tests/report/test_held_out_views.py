@@ -15,10 +15,10 @@ from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.report.held_out_views import (
     POINTS,
     inner_points,
-    mean_and_sd,
     object_angles,
     point_spectra,
     render_held_out,
+    sample_mean_and_sd,
     score_view,
     spread_of_views,
 )
@@ -45,7 +45,7 @@ def test_a_view_that_is_off_by_a_constant(device):
 
 
 def test_mean_and_deviation_over_the_views_that_have_a_band():
-    mean, sd = mean_and_sd(np.array([[1.0, np.nan, 5.0], [3.0, np.nan, np.nan]]))
+    mean, sd = sample_mean_and_sd(np.array([[1.0, np.nan, 5.0], [3.0, np.nan, np.nan]]))
     np.testing.assert_allclose(mean, [2.0, np.nan, 5.0])
     np.testing.assert_allclose(sd, [np.sqrt(2.0), np.nan, 0.0])
 

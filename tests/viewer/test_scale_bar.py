@@ -73,9 +73,9 @@ def test_the_bar_follows_the_camera_and_goes_where_the_object_is_behind_it():
     np.testing.assert_allclose(label["position"], (bar.start + bar.end) / 2.0)
     dark, light = (line[0] for line in lines)
     np.testing.assert_allclose(dark, [bar.start, bar.end])
-    # The light line lies on the dark one: at the same places of the picture, before it.
-    places, depths = zip(*(picture_of(browser.camera, line) for line in (dark, light)), strict=True)
-    np.testing.assert_allclose(*places, atol=1e-9)
+    # The light line lies on the dark one: at the same pixels of the picture, before it.
+    pixels, depths = zip(*(picture_of(browser.camera, line) for line in (dark, light)), strict=True)
+    np.testing.assert_allclose(*pixels, atol=1e-9)
     assert (depths[1] < depths[0]).all()
     others = {
         "10 mm": [camera_at(0.1)],

@@ -16,7 +16,7 @@ from hsi_sc_nerf.settings_file import between
 from hsi_sc_nerf.simulate.effect import Effect
 from hsi_sc_nerf.simulate.light import HitLight, Reflection, SurfaceLight, SurfaceLightEffect, ViewLightEffect
 from hsi_sc_nerf.simulate.render import RAY_START_M, Hits
-from hsi_sc_nerf.simulate.surface import Surface
+from hsi_sc_nerf.simulate.surface import SceneSurface
 
 DIRECTIONS = 96
 """Default number of directions in which the surroundings of a point are sampled."""
@@ -94,7 +94,7 @@ class Lamp(ViewLightEffect):
         lamp[lit] = self.fraction * cosine[lit] * hits.is_unoccluded(to_lamp, lit)
         return replace(light, chamber=light.chamber * np.float32(1.0 - self.fraction), lamp=lamp, to_lamp=to_lamp)
 
-    def on_points(self, surface: Surface, camera_to_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "p"]:
+    def on_points(self, surface: SceneSurface, camera_to_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "p"]:
         """Irradiance of the lamp at the points of a surface."""
         to_lamp, normals = self.direction(camera_to_world), surface.mesh.vertex_normals()
         cosine = np.maximum(normals @ to_lamp, 0.0)

@@ -13,7 +13,7 @@ from hsi_sc_nerf.simulate.light import Lighting, colour_spectra, even_light, ren
 from hsi_sc_nerf.simulate.mesh import cylinder, quads, revolve
 from hsi_sc_nerf.simulate.render import Part, Renderer
 from hsi_sc_nerf.simulate.scene import load_scene, override
-from hsi_sc_nerf.simulate.surface import Surface, cosine_directions, split_at_creases
+from hsi_sc_nerf.simulate.surface import SceneSurface, cosine_directions, split_at_creases
 
 RADIUS_M = 0.03
 CAMERA = PinholeIntrinsics(24, 24, 60.0, 60.0, 12.0, 12.0)
@@ -165,7 +165,7 @@ def wall_and_floor(height_m=0.1):
     ]
     floor = Mesh(np.concatenate(rows), np.array(triangles))
     wall = quads(np.array([[[0.0, 20.0, 0.0], [0.0, 20.0, height_m], [0.0, -20.0, height_m], [0.0, -20.0, 0.0]]]))
-    surface = Surface(Renderer([part(floor, "floor"), part(wall, "wall")]))
+    surface = SceneSurface(Renderer([part(floor, "floor"), part(wall, "wall")]))
     points = np.argsort(surface.vertex)
     hidden = 0.5 * (1.0 - DISTANCES_M / np.hypot(DISTANCES_M, height_m))
     return surface, points[8:14], points[21:], hidden
@@ -206,8 +206,8 @@ def test_contact_shadow_of_a_drum_on_a_disc_as_by_brute_force():
     # The mean over azimuths is free of most of the chance in single points.
     azimuth = np.linspace(0.0, 2 * np.pi, 90, endpoint=False)
     around = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
-    places = (radius_m + distance_m)[:, None, None] * around
-    light = light_below(lighting, places.reshape(-1, 2))[(1,)].reshape(len(distance_m), -1).mean(axis=1)
+    positions = (radius_m + distance_m)[:, None, None] * around
+    light = light_below(lighting, positions.reshape(-1, 2))[(1,)].reshape(len(distance_m), -1).mean(axis=1)
 
     rays = cosine_directions(100_000, np.zeros(1))[0]
     slow = []
