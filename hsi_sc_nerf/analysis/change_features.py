@@ -14,7 +14,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import SpectralCloud
 
 SPACINGS_M = (0.005, 0.002)
-"""Of the coarse sample, from which the search starts, and of the fine one."""
+"""Spacings of the coarse sample, from which the search starts, and of the fine one."""
 COMPONENTS = 3
 """Principal components of the spectra's shape that count, beside brightness."""
 LEAST_POINTS = 100

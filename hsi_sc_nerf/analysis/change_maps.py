@@ -25,9 +25,10 @@ from hsi_sc_nerf.spectra import require_bands
 
 SPECTRUM, BRIGHTNESS, SURFACE = "spectrum", "brightness", "surface"
 CLASSES = "classes"
-"""Of files with maps of classes."""
+"""Name of the files with maps of classes."""
 MISPLACED_M = 0.0003
-"""How far two runs' spectra of one place lie apart beside the error of the registration, by blur and smoothing."""
+"""Distance between the spectra of one point in two runs that blur and smoothing cause, beside the error of the
+registration."""
 RIM_M = 0.006
 """Patches this near to what is not seen lie at its rim: seen at grazing angles, beside what the object stands on."""
 _LEAST_PATCHES = 20

@@ -99,10 +99,11 @@ def class_areas(
 ) -> ClassAreas:
     """Areas of the classes in a region, and their standard deviations.
 
-    An area errs by three causes, as far as they are known: by the difference to the area that the probabilities
-    expect, ``sum(area * probability)``, which is what doubt over a whole region amounts to; by the doubt of each
-    pixel, ``probability * (1 - probability)``, independent from pixel to pixel; and by the noise of the spectra: half
-    of the area that one more draw of it gives to or takes from the class, likewise.
+    The standard deviation of an area has three known causes. The first is the difference between the area and its
+    expectation ``sum(area * probability)``, which is doubt that a whole region shares. The second is the doubt of
+    each pixel, with the variance ``probability * (1 - probability)``, independent from pixel to pixel. The third is
+    the noise of the spectra: half of the area that one more draw of the noise moves to or from the class, also
+    independent from pixel to pixel.
 
     Args:
         one: the classifier's map.

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from hsi_sc_nerf import paper
 
 LEAST_POINTS = 24
-"""Of a part, and of a ring beside its edge."""
+"""Fewest points of a part, and of a ring beside its edge."""
 LARGEST = 0.5
 """Fraction of the points that a part may have: the body is the largest one."""
 _RADII = 60

@@ -1,7 +1,8 @@
 """A training step's forward and backward pass as one CUDA graph.
 
-A step is some thousand small operations. Launched one by one from Python they take several times as long as the GPU
-needs to do them. Captured once, they are launched together: same operations, same random numbers, other rays.
+A step is some thousand small operations. Launching them one by one from Python takes longer than the GPU needs to do
+them (docs/validation/reconstruction.md). Captured once, they are launched together: same operations, same random
+numbers, other rays.
 """
 
 from __future__ import annotations

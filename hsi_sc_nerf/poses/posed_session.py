@@ -167,7 +167,8 @@ def _foot_gradient(adjusted: Adjusted, outline: ContainerOutline) -> Float[np.nd
 def _landmark_gradients(adjusted: Adjusted) -> tuple[Float[np.ndarray, "p"], Float[np.ndarray, "p"]]:
     """Derivatives of the disc's height, and of the log of the landmarks' distances from the axis (RMS).
 
-    By camera, angles and the rest, with all landmarks following. Markers count where there are any.
+    The derivatives are those by the camera, the angles and the other parameters; all landmarks follow. If there are
+    markers, they are the landmarks.
     """
     turntable = adjusted.turntable
     # The markers' residuals come last, where there are any.

@@ -23,10 +23,10 @@ CUT_LINES, CUT_FRAMES = 0.05, 0.1
 fraction of the frames."""
 MAX_CONTRADICTION = 0.04
 """Largest typical difference of mask and hull's silhouette (1 - intersection over union), to which a quarter of a
-pixel along the mask's outline is added. Good masks have half of it, because the hull is found by vote."""
+pixel along the mask's outline is added. Good masks differ too, because the hull is found by vote."""
 VOTE_EXCESS = 0.015
-"""A narrow or rough object may differ by more: by so much more than the hull's silhouettes do from the hull of their
-own, which consistent masks give. Chosen on an ear of maize of 1 mm a pixel, held against pear, apple and tomato."""
+"""A narrow or rough object may differ by more. Its limit is the difference of the hull's silhouettes from the hull of
+these silhouettes, as consistent masks have it, plus this."""
 MAX_ODDITY, ODDITY_SIGMAS = 0.015, 5.0
 """Largest excess of one frame's difference over the typical one, to which an eighth of a pixel is added; and the same
 in standard deviations of the frames' differences, for noise frays masks."""
