@@ -87,9 +87,9 @@ def changed_regions(
     deviation of the area.
 
     The height is the 90th percentile of the change. The difference between the values of both days inside and
-    those outside is taken instead where it is larger: a narrow ring around a bruise has blurred edges and no plateau, but the
-    bruise has one. Where the surface itself has other colours the latter may be too large, so that it is at most a
-    quarter more.
+    those outside is taken instead where it is larger: a narrow ring around a bruise has blurred edges and no plateau,
+    but the bruise has one. Where the surface itself has other colours the latter may be too large, so that it is at
+    most a quarter more.
 
     Args:
         mesh: the surface.
