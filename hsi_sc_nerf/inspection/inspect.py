@@ -155,7 +155,6 @@ def check_scale(session: Session, poses: PoseMethod, scale_known: bool) -> Findi
     """The finding ``scale``: whether anything gives the scale.
 
     Args:
-        session: the session.
         poses: how poses will be found; from features or angles they may do without a scale.
         scale_known: whether something beside ``session.json`` gives it.
     """

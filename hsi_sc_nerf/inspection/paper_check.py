@@ -32,7 +32,6 @@ def check_paper(session: Session, quicklooks: Sequence[Quicklook], detections: S
     """The findings ``paper``, where the session's white is a tarp, and ``veil``, where markers are large enough.
 
     Args:
-        session: the session.
         quicklooks: of its frames.
         detections: markers of each frame.
     """

@@ -80,7 +80,6 @@ def quicklook_of(capture: Capture, white: Float[np.ndarray, "bands"]) -> Quicklo
     """The quicklook of one capture.
 
     Args:
-        capture: the capture.
         white: counts of a white above dark, of the same integration time.
     """
     cube = capture.cube

@@ -84,7 +84,6 @@ def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"]) -> RunLi
     """Fit the light on the object of a run.
 
     Args:
-        run: the trained run.
         white_normal: outward unit normal of the white reference, camera's frame (OpenGL axes).
 
     Raises:

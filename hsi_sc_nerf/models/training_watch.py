@@ -63,7 +63,6 @@ class NonFiniteGuard:
         """Record a step; returns a sentence to print if it was skipped, else None.
 
         Args:
-            step: the step.
             losses: names of the loss terms that were not finite.
             groups: names of the parameter groups whose gradient was not finite.
 
@@ -98,7 +97,6 @@ class RisenLossGuard:
         """Record a step that has ended.
 
         Args:
-            step: the step.
             schedule: of the run; a stage's first loss is the one to compare with until there is a smaller median.
             loss: of all terms; one that is not finite does not count.
 
