@@ -40,11 +40,11 @@ class Quantity:
 
     Attributes:
         name: ``spectrum``, ``brightness``, ``surface``, ``R680`` or the name of an index.
-        unit: of the change; "rad" of the spectral angle, "mm" of the surface, else "1".
+        unit: unit of the change; "rad" of the spectral angle, "mm" of the surface, else "1".
         change: after less before at each vertex; of the spectrum, the spectral angle between the two. NaN where it is
             not known.
         p: adjusted for false discoveries, of the patch of each vertex; 1 where it is not known.
-        test: of the patches and of the whole surface.
+        test: test of the patches and of the whole surface.
         region: number of each vertex's region, -1 outside.
         regions: areas that changed beyond noise, and otherwise than the whole surface, the largest first.
         limit_m2: regions up to this area are undecided (`limit_of_blank_m2`); 0 with a repeat.

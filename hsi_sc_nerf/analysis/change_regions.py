@@ -93,10 +93,10 @@ def changed_regions(
 
     Args:
         mesh: the surface.
-        areas_m2: of the vertices.
-        patches: of the vertices.
+        areas_m2: areas of the vertices.
+        patches: patches of the vertices.
         before: values of each vertex on the first day.
-        change: of each vertex since then, less that of the whole surface; NaN where it is not known.
+        change: change of each vertex since then, less that of the whole surface; NaN where it is not known.
         significant: whether the change of each patch is.
         noise: standard deviations of a usual patch's changes.
         smallest_m2: regions below this area are left out.

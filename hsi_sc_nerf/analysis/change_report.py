@@ -84,7 +84,7 @@ def write_change_tables(
 
     Args:
         folder: for the files.
-        comparisons: of the days.
+        comparisons: comparisons of the days.
         settings: that are kept in change.json.
         pictures: names of files by title.
         repeat: another capture of the first day, if the noise is also taken from it.

@@ -37,8 +37,8 @@ class Patches:
 
     Attributes:
         of_vertex: number of the patch of each vertex, -1 where it is not seen.
-        centres_m: of each patch.
-        areas_m2: of each patch.
+        centres_m: centres of each patch.
+        areas_m2: areas of each patch.
     """
 
     of_vertex: Int[np.ndarray, "v"]
@@ -121,7 +121,7 @@ def significance(
 
     Args:
         change: after less before, NaN where it is not known.
-        centres_m: of the patches.
+        centres_m: centres of the patches.
         misplaced: change of each patch that an error of the registration would make.
         session_sd: standard deviation of errors that a whole session shares.
         conditions: what makes the errors of a patch larger, each column the larger the harder; none by default.

@@ -25,7 +25,7 @@ class ClassMap:
     """What a classifier says of a surface.
 
     Attributes:
-        name: of the classifier.
+        name: name of the classifier.
         classes: their names.
         probabilities: of each class; NaN where the surface is unseen, or its spectrum unlike all that the classifier
             was fitted on.
@@ -57,7 +57,7 @@ class ClassAreas:
     """Areas of a classifier's classes in a region.
 
     Attributes:
-        areas_m2: of the surface whose most probable class is each.
+        areas_m2: areas of the surface whose most probable class is each.
         stds_m2: their standard deviations, without that of the mesh's size; NaN where pixels are not known.
         outside_m2: area whose spectra are unlike all that the classifier was fitted on.
     """

@@ -61,7 +61,7 @@ def propose_organs(
 
     Args:
         points_m: on the surface, object frame: z up along the turntable's axis.
-        spectra: of the points, finite.
+        spectra: spectra of the points, finite.
 
     Returns:
         The points of each organ by its name, the body first (of an ear, the kernels). A slim part is a stem, a part

@@ -44,8 +44,8 @@ def sharpest_edge(
     """The edge with the largest separation; 0 where no two rings differ by an angle that tells materials apart.
 
     Args:
-        distance: of the points from one point.
-        features: of their spectra.
+        distance: distance of the points from one point.
+        features: features of their spectra.
         rest: points that count.
         between: least and largest radius.
         largest: fraction of the points that may lie inside.

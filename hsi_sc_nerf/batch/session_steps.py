@@ -169,7 +169,7 @@ def bring_up_to_date(step: Step, out: Path, console: Console, title: str, run_st
         step: one of `session_steps`.
         out: folder of the results.
         console: for the title and the command.
-        title: of the step.
+        title: title of the step.
         run_step: runs the command.
 
     Returns:

@@ -167,7 +167,7 @@ def check_frames(
     """The findings ``exposure``, ``focus``, ``copies`` and ``other-object``.
 
     Args:
-        quicklooks: of its frames.
+        quicklooks: quicklooks of its frames.
         detections: markers of each frame.
     """
     return [

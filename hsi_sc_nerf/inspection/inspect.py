@@ -40,7 +40,7 @@ class Inspection:
 
     Attributes:
         session: the session, with the rotation of its images as measured.
-        quicklooks: of each frame.
+        quicklooks: quicklooks of each frame.
         markers: the markers of the frames.
         findings: results of all checks.
         session_json: content of ``session.json`` with what could be measured filled in; None for what is not known.

@@ -42,7 +42,7 @@ class Quicklook:
     """A capture by a few of its lines and bands. Pictures are oriented as in the file.
 
     Attributes:
-        name: of the capture.
+        name: name of the capture.
         picture: pseudo-RGB, about 1 on white.
         top_counts: the largest reading of the lines read.
         at_top_fraction: fraction of the readings with ``top_counts``, by band.

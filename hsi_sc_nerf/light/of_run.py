@@ -46,7 +46,7 @@ class RunLight:
     Attributes:
         run: the trained run.
         light: irradiance and materials.
-        evidence: of uneven light.
+        evidence: evidence of uneven light.
         renders: depth maps of the training frames.
         mesh: the object's surface, scene units.
     """

@@ -76,7 +76,7 @@ class CapturedSteps:
         Args:
             kind: what else the step's operations depend on: stage, frozen parameters. Not the annealing of the
                 proposals, which is handed over by its value.
-            rays: of the batch, all of them with the same parts in every call.
+            rays: rays of the batch, all of them with the same parts in every call.
             batch: tensors on the device, likewise.
             seed: draws the step's random numbers anew; called before each pass.
         """

@@ -98,7 +98,7 @@ class RisenLossGuard:
 
         Args:
             schedule: of the run; a stage's first loss is the one to compare with until there is a smaller median.
-            loss: of all terms; one that is not finite does not count.
+            loss: loss of all terms; one that is not finite does not count.
 
         Raises:
             TrainingDivergedError: this was the last of `MAX_RISEN_IN_A_ROW`, or the stage ends with a risen loss.

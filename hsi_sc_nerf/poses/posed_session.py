@@ -49,7 +49,7 @@ def in_object_frame(
 
     Args:
         adjusted: in any unit of length.
-        outline: of the container in the same unit, which gives the disc's height.
+        outline: outline of the container in the same unit, which gives the disc's height.
         specific: what the method itself knows for ``TurntablePoses``.
     """
     source, metres = scale_of(adjusted.turntable, info, outline)
@@ -112,9 +112,9 @@ def pose_uncertainty(
     """Uncertainty of camera, angles and poses; the length that gives the scale is taken for exact.
 
     Args:
-        covariance: of its parameters (``Adjusted.covariance``).
+        covariance: covariance of its parameters (``Adjusted.covariance``).
         metres: length of its unit.
-        outline: of the container, where its radius gives the scale and its foot the disc's height.
+        outline: outline of the container, where its radius gives the scale and its foot the disc's height.
     """
     layout, turntable = adjusted.problem.layout, adjusted.turntable
     sigmas = np.sqrt(covariance.diagonal())

@@ -63,7 +63,7 @@ def check_appearance(views: PointViews, names: Sequence[str]) -> list[Finding]:
 
     Args:
         views: points of the object as the frames see them.
-        names: of all frames.
+        names: names of all frames.
 
     Example:
         >>> refuse_red(check_appearance(point_views(bins, masks, poses, lens, distortion, hull), names))
@@ -168,7 +168,7 @@ def slip_between(
 
     Args:
         views: all of them.
-        channels: of each, in units of their scatter.
+        channels: channels of each, in units of their scatter.
         first, second: rows of the two frames.
 
     Returns:
@@ -218,7 +218,7 @@ def check_band_order(
 
     Args:
         spectrum: the object's mean reflectance.
-        wavelengths_nm: of its bands.
+        wavelengths_nm: wavelengths of its bands.
 
     Example:
         >>> check_band_order(np.array([0.6, 0.1]), np.array([450.0, 900.0]))[0].level

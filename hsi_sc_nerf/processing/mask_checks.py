@@ -55,7 +55,7 @@ def check_masks(
     """Findings on the masks; none for good ones.
 
     Args:
-        hull: of the masks.
+        hull: hull of the masks.
         left_out: frames with a piece that its mask leaves out (`masks.foreground_masks`).
         silhouettes_of: gives those of the visual hull of other masks.
         regions: pixels that may be the object's (`masks.above_lid`), if the container is known.
@@ -207,7 +207,7 @@ def _odd(
     """Which masks contradict their silhouettes by ``excess`` more than a typical one; contradiction without noise.
 
     Args:
-        contradiction: of the masks and their silhouettes, noise included.
+        contradiction: contradiction of the masks and their silhouettes, noise included.
     """
     filled = masks.any(axis=(1, 2))
     scatter = float(median_abs_deviation(contradiction[filled], scale="normal"))

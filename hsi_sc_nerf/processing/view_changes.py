@@ -164,10 +164,10 @@ class PointViews:
     Attributes:
         point: number of the point.
         frame: number of the frame.
-        normal: of the point in the camera's frame: right, up, towards the camera.
+        normal: normal of the point in the camera's frame: right, up, towards the camera.
         reflectance: by colour.
-        positions_m: of the points, object frame.
-        normals: of the points, object frame.
+        positions_m: positions of the points, object frame.
+        normals: normals of the points, object frame.
     """
 
     point: Int[np.ndarray, "n"]
