@@ -20,6 +20,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import griffe
 import tyro
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
@@ -43,6 +44,15 @@ TABLE = re.compile(r'\{\{ results\("([a-z_]+)"\) \}\}')
 def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
     """Put the results' tables into a page, and let its links lead to the pages that are made from the code."""
     return site_links(TABLE.sub(lambda match: results_table(match.group(1)), markdown), page.file.src_uri)
+
+
+class ExamplesAsCode(griffe.Extension):
+    """Let mkdocstrings show the examples of docstrings as code: it knows their section as ``Examples`` alone."""
+
+    def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
+        """Rename the section of one object's docstring."""
+        if obj.docstring:
+            obj.docstring.value = re.sub(r"^( *)Example:$", r"\1Examples:", obj.docstring.value, flags=re.MULTILINE)
 
 
 def site_links(markdown: str, uri: str) -> str:

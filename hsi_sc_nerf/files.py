@@ -25,7 +25,7 @@ TEMPORARY_PREFIX = ".partial-"
 LARGEST_DEFLATION = 1032
 _MODES = {1: cv2.IMREAD_GRAYSCALE, 3: cv2.IMREAD_COLOR}
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
-"""By PNG's numbers of the kinds of colour."""
+"""Number of channels by PNG's number of the kind of colour."""
 
 
 @contextmanager

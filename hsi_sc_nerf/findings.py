@@ -28,7 +28,7 @@ class Finding:
     """The result of one check.
 
     Attributes:
-        name: of the check, in lower case with hyphens; ``--accept`` takes it.
+        name: name of the check, in lower case with hyphens; ``--accept`` takes it.
         level: how serious it is.
         sentence: what is so, and for amber and red what to do; one sentence.
         values: the measured figures behind it, ready for JSON.
@@ -74,7 +74,7 @@ def judged(name: str, value: float, limits: tuple[float, float], sentence: str, 
     """The finding on a value: green up to the first limit, amber up to the second, red above.
 
     Args:
-        limits: of green and of amber, in the value's unit.
+        limits: limits of green and of amber, in the value's unit.
         sentence: what is so, without a full stop.
         advice: what to do, given unless it is green.
     """
@@ -93,7 +93,7 @@ class EffectEvidence:
         evidence: how strong the effect is; None where it could not be measured.
         noise: standard deviation of what is found where the effect is absent, in the same unit; None if unknown.
         threshold: the effect is present where the evidence exceeds it; None where something else decided.
-        unit: of these three.
+        unit: unit of these three.
         sentence: what is so, and what follows from it.
     """
 

@@ -28,9 +28,9 @@ class NumberTable:
 
     Attributes:
         notes: lines that begin with #, without it.
-        titles: of the columns, from the first line that is not numbers; empty without such a line.
+        titles: titles of the columns, from the first line that is not numbers; empty without such a line.
         numbers: NaN for empty cells and NA.
-        lines: of the file, by row.
+        lines: lines of the file, by row.
     """
 
     notes: tuple[str, ...]

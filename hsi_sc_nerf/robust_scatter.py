@@ -19,7 +19,7 @@ def robust_std(
     Up to half of the values may be anything. NaN is left out.
 
     Args:
-        deviation: of the values from what is expected.
+        deviation: deviation of the values from what is expected.
         axis: along which the values lie; all of them without it.
         least: smallest that is returned.
 

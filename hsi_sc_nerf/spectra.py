@@ -99,7 +99,7 @@ COMPOSITES = {
         Composite("CIR", (800.0, 670.0, 550.0), "living green tissue, which appears red"),
     )
 }
-"""By name."""
+"""The composites by name."""
 
 
 def available_composites(wavelengths_nm: Float[np.ndarray, "bands"]) -> list[Composite]:

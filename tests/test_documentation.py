@@ -148,3 +148,20 @@ def test_the_errors_of_the_presets_in_a_page_are_the_committed_ones(page):
     measured = {row[column].split()[0] for row in rows if row[0] == "presets" for column in columns}
     # SAM of a run of minutes is between 0.005 and 0.02 rad; other figures of the paragraph have fewer digits.
     assert {*re.findall(r"0\.0[01]\d\d", paragraph)} == measured
+
+
+def test_examples_of_docstrings_are_shown_as_code():
+    griffe = documentation.griffe
+    text = "What it does.\n\nArgs:\n    one: a number.\n\nExample:\n    >>> one(1)\n    1"
+    function = griffe.Function("one", docstring=griffe.Docstring(text))
+    documentation.ExamplesAsCode().on_object(obj=function)
+    kinds = [section.kind.value for section in griffe.parse_google(function.docstring)]
+    assert kinds == ["text", "parameters", "examples"]
+
+
+def test_warnings_of_the_site_end_ci():
+    """mkdocs counts only the warnings that it prints."""
+    command = re.search(r"mkdocs build.*", (ROOT / ".ci" / "run").read_text(encoding="utf-8"))
+    assert command is not None
+    assert "quiet" not in command.group()
+    assert "\nstrict: true\n" in (ROOT / "mkdocs.yml").read_text(encoding="utf-8")

@@ -47,7 +47,7 @@ class Domain:
         scale: divided by then.
         weights: give the scores.
         loadings: give a spectrum back from its scores.
-        variances: of the scores.
+        variances: variances of the scores.
         t2_limit: largest Hotelling T², the scores' squares by their variances; infinite for none.
         q_limit: largest Q, the sum of squares that the scores do not give back; infinite for none.
     """
@@ -74,16 +74,16 @@ class Calibration:
     """A regression on spectra, or a classifier of them.
 
     Attributes:
-        name: of what it tells.
-        unit: of its values.
+        name: name of what it tells.
+        unit: unit of its values.
         error: standard deviation of its predictions (RMSEP); 0 if it is not known.
-        wavelengths_nm: of the spectra that it takes.
-        steps: of the pre-processing.
+        wavelengths_nm: wavelengths of the spectra that it takes.
+        steps: steps of the pre-processing.
         used: bands that the model takes after it.
         reference: spectrum of the scatter correction.
         predict: the model, from pre-processed spectra; of a classifier the probability of each class.
         domain: what it was fitted on; None if that is not known.
-        classes: of a classifier, in the order of its probabilities; empty for a regression.
+        classes: classes of a classifier, in the order of its probabilities; empty for a regression.
     """
 
     name: str

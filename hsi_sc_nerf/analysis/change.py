@@ -24,7 +24,7 @@ class ClassChange:
     """The class by mixture of each vertex on two days.
 
     Attributes:
-        names: of the classes.
+        names: names of the classes.
         before: number of the class on the first day; -1 in no class, or unseen.
         after: the same on the later day; that of the first day where spectrum and brightness did not change beyond
             noise.

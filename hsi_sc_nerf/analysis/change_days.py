@@ -30,7 +30,7 @@ class Day:
     """An object on a day.
 
     Attributes:
-        name: of the day.
+        name: name of the day.
         surface: the first day's mesh with this day's spectra.
         raised_m: distance of this day's points from the mesh along its normals.
         conditions: of the points around each vertex what makes their errors larger, the larger the worse: smallest
@@ -57,9 +57,9 @@ def days_on_one_mesh(
     Spectra are the material's if all clouds have them.
 
     Args:
-        clouds: of one object, in the order of days.
-        names: of the days.
-        config: of the mesh.
+        clouds: clouds of one object, in the order of days.
+        names: names of the days.
+        config: configuration of the mesh.
         max_incidence_deg: points that no camera sees at a smaller angle give no spectra.
         track: wraps the starts of each registration, for a progress bar.
 

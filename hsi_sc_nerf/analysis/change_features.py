@@ -14,7 +14,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import SpectralCloud
 
 SPACINGS_M = (0.005, 0.002)
-"""Of the coarse sample, from which the search starts, and of the fine one."""
+"""Spacings of the coarse sample, from which the search starts, and of the fine one."""
 COMPONENTS = 3
 """Principal components of the spectra's shape that count, beside brightness."""
 LEAST_POINTS = 100
@@ -30,7 +30,7 @@ class SurfaceSample:
     Attributes:
         points: metres.
         normals: outward unit normals.
-        features: of the spectra, about 0: a change of the whole surface alike is no feature.
+        features: features of the spectra, about 0: a change of the whole surface alike is no feature.
     """
 
     points: Float[np.ndarray, "n 3"]
@@ -46,8 +46,8 @@ def surface_samples(
     Features are the logarithm of brightness, and the principal components of the spectra scaled to unit length.
 
     Args:
-        clouds: of one object, same bands.
-        spectra: of the points of each, as measured or of the material.
+        clouds: clouds of one object, same bands.
+        spectra: spectra of the points of each, as measured or of the material.
 
     Raises:
         InputError: a cloud has too few points.

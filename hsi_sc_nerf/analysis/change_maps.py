@@ -25,9 +25,10 @@ from hsi_sc_nerf.spectra import require_bands
 
 SPECTRUM, BRIGHTNESS, SURFACE = "spectrum", "brightness", "surface"
 CLASSES = "classes"
-"""Of files with maps of classes."""
+"""Name of the files with maps of classes."""
 MISPLACED_M = 0.0003
-"""How far two runs' spectra of one place lie apart beside the error of the registration, by blur and smoothing."""
+"""Distance between the spectra of one point in two runs that blur and smoothing cause, beside the error of the
+registration."""
 RIM_M = 0.006
 """Patches this near to what is not seen lie at its rim: seen at grazing angles, beside what the object stands on."""
 _LEAST_PATCHES = 20
@@ -39,11 +40,11 @@ class Quantity:
 
     Attributes:
         name: ``spectrum``, ``brightness``, ``surface``, ``R680`` or the name of an index.
-        unit: of the change; "rad" of the spectral angle, "mm" of the surface, else "1".
+        unit: unit of the change; "rad" of the spectral angle, "mm" of the surface, else "1".
         change: after less before at each vertex; of the spectrum, the spectral angle between the two. NaN where it is
             not known.
         p: adjusted for false discoveries, of the patch of each vertex; 1 where it is not known.
-        test: of the patches and of the whole surface.
+        test: test of the patches and of the whole surface.
         region: number of each vertex's region, -1 outside.
         regions: areas that changed beyond noise, and otherwise than the whole surface, the largest first.
         limit_m2: regions up to this area are undecided (`limit_of_blank_m2`); 0 with a repeat.

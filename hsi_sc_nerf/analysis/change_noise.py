@@ -45,7 +45,7 @@ def noise_of_patches(
         change: about 0 where nothing changed; NaN where it is not known.
         conditions: what makes errors larger, each column the larger the harder the patch; only the order counts.
         misplaced: standard deviation of each change by the registration, which comes on top and is not returned.
-        centres_m: of the patches.
+        centres_m: centres of the patches.
 
     Example:
         >>> random, hard = np.random.default_rng(0), np.arange(900.0)[:, None]

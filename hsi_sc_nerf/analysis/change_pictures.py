@@ -84,10 +84,10 @@ def write_film(path: Path, first: Day, comparisons: Sequence[DayComparison], vie
     """The days one after the other on one mesh, faded into each other: pseudo-RGB, and change since the first.
 
     Args:
-        path: of the film, MP4.
+        path: path of the film, MP4.
         first: the first day.
         comparisons: the later days.
-        views: of the mesh.
+        views: views of the mesh.
         shown: name of the quantity.
     """
     last = comparisons[-1].quantities[shown]

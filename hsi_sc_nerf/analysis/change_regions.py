@@ -30,7 +30,7 @@ objects. On smaller ones, patches of one size make regions of one size."""
 OUTSIDE = -1
 _PLATEAU_PERCENT = 90.0
 _MOST_CONTRAST = 1.25
-"""Of inside and outside, relative to the plateau of the change."""
+"""Largest contrast of inside and outside, relative to the plateau of the change."""
 _ROUNDS = 10
 _GAP = 2.5
 """Distance, in patches, of the centres of two that belong together."""
@@ -86,17 +86,17 @@ def changed_regions(
     connected to them belongs to it. The edges at one standard deviation of the noise more and less give the standard
     deviation of the area.
 
-    The height is the 90th percentile of the change or, where that is larger, by how much the values of both days
-    inside differ from those outside: on a narrow ring around a bruise, blurred edges leave no plateau, but the bruise
-    has one. Where the surface itself has other colours the latter may be too large, so that it is at most a quarter
-    more.
+    The height is the 90th percentile of the change. The difference between the values of both days inside and
+    those outside is taken instead where it is larger: a narrow ring around a bruise has blurred edges and no plateau,
+    but the bruise has one. Where the surface itself has other colours the latter may be too large, so that it is at
+    most a quarter more.
 
     Args:
         mesh: the surface.
-        areas_m2: of the vertices.
-        patches: of the vertices.
+        areas_m2: areas of the vertices.
+        patches: patches of the vertices.
         before: values of each vertex on the first day.
-        change: of each vertex since then, less that of the whole surface; NaN where it is not known.
+        change: change of each vertex since then, less that of the whole surface; NaN where it is not known.
         significant: whether the change of each patch is.
         noise: standard deviations of a usual patch's changes.
         smallest_m2: regions below this area are left out.

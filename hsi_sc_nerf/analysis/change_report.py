@@ -24,7 +24,7 @@ COLUMNS = (
     *("before", "after", "kind", "name", "region", "unit", "change", "change_sd", "p"),
     *("area_before_cm2", "area_after_cm2", "area_change_cm2", "area_change_sd_cm2", "x_mm", "y_mm", "z_mm"),
 )
-"""Of change.csv."""
+"""Columns of change.csv."""
 WHOLE = "whole surface"
 CHANGED, UNDECIDED = "change", "undecided"
 """Kinds of rows: regions that count, and those up to the limit of blank."""
@@ -84,7 +84,7 @@ def write_change_tables(
 
     Args:
         folder: for the files.
-        comparisons: of the days.
+        comparisons: comparisons of the days.
         settings: that are kept in change.json.
         pictures: names of files by title.
         repeat: another capture of the first day, if the noise is also taken from it.

@@ -1,9 +1,10 @@
 """Whether a part of a surface changed by more than the errors of two clouds, which are smooth over centimetres.
 
-The errors of a cloud from a radiance field are biases that neighbours share, other ones in each run; the scatter of
-frames, which a cloud's columns state, says little of them. Their size is therefore taken from the changes themselves,
-robustly, as what most of the surface shows; how many independent parts that estimate rests on, from how far the
-changes of two patches are alike; and the test is Student's (or Hotelling's), whose tails know that they are few.
+The errors of a cloud from a radiance field are biases that neighbours share and that differ from run to run. The
+scatter of frames, which a cloud's columns state, does not show them. Their size is therefore a robust estimate from
+the changes of most of the surface. The distance at which changes of patches are correlated gives the number of
+independent parts of that estimate. The test is Student's (or Hotelling's), whose heavier tails account for the small
+number of parts.
 """
 
 from __future__ import annotations
@@ -20,13 +21,14 @@ from hsi_sc_nerf.analysis.change_noise import PATCH_M, correlation, noise_of_pat
 FALSE_DISCOVERIES = 0.05
 """Expected fraction of the patches called changed that did not (Benjamini and Yekutieli 2001)."""
 _BIWEIGHT_EFFICIENCY = 0.87
-"""Of the biweight scale with this constant, for normal errors: so much of the sample counts."""
+"""Efficiency of the biweight scale for normal errors: the fraction of the sample that counts."""
 _NEAR_M = 0.015
 """Within this distance of a place, errors are of one size."""
 _LARGEST = 2.0
 """The largest of some ten normal errors, in standard deviations."""
 _OBSERVATIONS = 12.0
-"""The noise of a patch in its own conditions is known as from so many at most: from the few that are like it."""
+"""Largest number of observations that the noise of a patch in its own conditions counts as: few patches are like
+it."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +37,8 @@ class Patches:
 
     Attributes:
         of_vertex: number of the patch of each vertex, -1 where it is not seen.
-        centres_m: of each patch.
-        areas_m2: of each patch.
+        centres_m: centres of each patch.
+        areas_m2: areas of each patch.
     """
 
     of_vertex: Int[np.ndarray, "v"]
@@ -111,14 +113,15 @@ def significance(
     (`hsi_sc_nerf.analysis.change_noise.noise_of_patches`). T², the sum of the k squared ratios, is compared with
     Hotelling's distribution for as many observations as there are independent parts, or like patches.
 
-    The changes ``repeat`` between two captures of one day are errors alone. No noise is less than theirs: neither
-    that of all patches, nor half of the largest error around a patch (for one at the rim of what is seen, anywhere at
-    the rim), nor what a whole session shares. Errors are as smooth as the smoother of the two. A patch has then
-    changed if its change is significant in itself, and beyond that of the whole surface.
+    The changes ``repeat`` between two captures of one day are errors alone. No noise is less than the repeat's. This
+    holds for the noise of all patches, for half of the largest error around a patch (for a patch at the rim of the
+    seen surface, anywhere at the rim), and for the error that a whole session shares. Errors are as smooth as the
+    smoother of the two. A patch has then changed if its change is significant in itself, and beyond that of the whole
+    surface.
 
     Args:
         change: after less before, NaN where it is not known.
-        centres_m: of the patches.
+        centres_m: centres of the patches.
         misplaced: change of each patch that an error of the registration would make.
         session_sd: standard deviation of errors that a whole session shares.
         conditions: what makes the errors of a patch larger, each column the larger the harder; none by default.

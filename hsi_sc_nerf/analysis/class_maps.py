@@ -25,7 +25,7 @@ class ClassMap:
     """What a classifier says of a surface.
 
     Attributes:
-        name: of the classifier.
+        name: name of the classifier.
         classes: their names.
         probabilities: of each class; NaN where the surface is unseen, or its spectrum unlike all that the classifier
             was fitted on.
@@ -57,7 +57,7 @@ class ClassAreas:
     """Areas of a classifier's classes in a region.
 
     Attributes:
-        areas_m2: of the surface whose most probable class is each.
+        areas_m2: areas of the surface whose most probable class is each.
         stds_m2: their standard deviations, without that of the mesh's size; NaN where pixels are not known.
         outside_m2: area whose spectra are unlike all that the classifier was fitted on.
     """
@@ -99,10 +99,11 @@ def class_areas(
 ) -> ClassAreas:
     """Areas of the classes in a region, and their standard deviations.
 
-    An area errs by three causes, as far as they are known: by the difference to the area that the probabilities
-    expect, ``sum(area * probability)``, which is what doubt over a whole region amounts to; by the doubt of each
-    pixel, ``probability * (1 - probability)``, independent from pixel to pixel; and by the noise of the spectra: half
-    of the area that one more draw of it gives to or takes from the class, likewise.
+    The standard deviation of an area has three known causes. The first is the difference between the area and its
+    expectation ``sum(area * probability)``, which is doubt that a whole region shares. The second is the doubt of
+    each pixel, with the variance ``probability * (1 - probability)``, independent from pixel to pixel. The third is
+    the noise of the spectra: half of the area that one more draw of the noise moves to or from the class, also
+    independent from pixel to pixel.
 
     Args:
         one: the classifier's map.

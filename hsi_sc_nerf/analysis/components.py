@@ -28,10 +28,10 @@ class Components:
 
     Attributes:
         supported: directions of the spectra above their noise.
-        scores: of the principal components, by descending variance; NaN where the surface is unseen.
-        variance_fractions: of the variance, of each component.
+        scores: scores of the principal components, by descending variance; NaN where the surface is unseen.
+        variance_fractions: fractions of the variance, of each component.
         endmembers: the spectra of the purest vertices.
-        fractions: of each endmember, by non-negative least squares; NaN where the surface is unseen.
+        fractions: fractions of each endmember, by non-negative least squares; NaN where the surface is unseen.
     """
 
     supported: int
@@ -92,7 +92,7 @@ def purest_spectra(coordinates: Float[np.ndarray, "n rank"], count: int) -> Int[
     coordinates in the simplex are by how much its volume grows if the spectrum replaces each corner.
 
     Args:
-        coordinates: of the spectra in their subspace.
+        coordinates: coordinates of the spectra in their subspace.
         count: at most its rank.
     """
     brightness = coordinates @ (mean := coordinates.mean(axis=0)) / (mean @ mean)

@@ -31,7 +31,7 @@ class DrawnRegion:
     """The surface that is nearer to a region's points than to any other.
 
     Attributes:
-        name: of the region.
+        name: name of the region.
         points_m: all points that it was drawn among (object frame).
         chosen: those in the region.
     """

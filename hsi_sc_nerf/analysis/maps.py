@@ -24,13 +24,13 @@ class SurfaceMap:
     """A number at each vertex.
 
     Attributes:
-        name: of the map.
+        name: name of the map.
         label: what it is, beside its picture: a formula, or a unit.
         values: NaN where none is known.
         of: computes the numbers of spectra at the surface's bands.
         error: standard deviation that all values share; 0 for none.
         definition: words that find the index again; empty for other maps.
-        unit: of the values; empty for none.
+        unit: unit of the values; empty for none.
         resampling_error: root mean square of what resampling the spectra changes.
         limited: of a calibration, whether it tells which spectra it was fitted on.
     """

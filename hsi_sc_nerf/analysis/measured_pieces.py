@@ -88,8 +88,8 @@ def write_pieces(folder: Path | str, pieces: Sequence[Measurement], name: str, p
 
     Args:
         folder: to write to.
-        pieces: of `measure_pieces`.
-        name: of the cloud, which the pages state.
+        pieces: pieces of `measure_pieces`.
+        name: name of the cloud, which the pages state.
         piece: number of the only one that was measured, which they state as well.
 
     Raises:

@@ -43,7 +43,7 @@ class Measurement:
 
     Attributes:
         surface: the closed mesh with its spectra.
-        size: of the mesh.
+        size: size of the mesh.
         uncertainty: standard deviation of each size by its cause; empty without splits.
         traits: spectra, indices, calibrations and classes of the regions.
         components: principal components and endmembers; None if none were to be found.

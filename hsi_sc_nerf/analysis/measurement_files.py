@@ -36,7 +36,7 @@ def write_measurement(folder: Path | str, measured: Measurement, name: str) -> d
     Args:
         folder: to write to.
         measured: the traits.
-        name: of the cloud, which the page states.
+        name: name of the cloud, which the page states.
 
     Returns:
         The content of ``traits.json``.

@@ -21,11 +21,12 @@ BODY, STEM, CALYX, LEAF, HUSK, KERNELS = "body", "stem", "calyx", "leaf", "husk"
 _SAMPLE = 4096
 """Points that the coordinates of spectra are found from, about."""
 _MOST_PARTS = 2
-"""At one end: a stem, and what it stands on; and at the sides."""
+"""Largest number of parts at one end (a stem, and what it stands on), and at the sides."""
 _MOST_SEARCHES = 5
-"""At one end: parts, and layers of mixed pixels."""
+"""Largest number of searches at one end: they find parts, and layers of mixed pixels."""
 _LEAST_SEPARATION = 6.0
-"""Standard deviations. What is no organ reaches 5 (skin that fades), organs of trained clouds 9 to 21."""
+"""Least separation of an organ in standard deviations: more than skin that fades reaches
+(docs/validation/surface.md)."""
 _SLIM, _WIDENS = 1.0 / 3.0, 2.0
 """A tip is slim if its spread is below this fraction of its length, and stands on something so many times wider."""
 _STEM_SHAPE = 0.5
@@ -60,12 +61,12 @@ def propose_organs(
 
     Args:
         points_m: on the surface, object frame: z up along the turntable's axis.
-        spectra: of the points, finite.
+        spectra: spectra of the points, finite.
 
     Returns:
-        Which points each organ has, the body first (of an ear, the kernels), by its name: stem, if it is slim;
-        husk, at an end of a long object; calyx, if it is small and at an end; leaf, if it stands off a side; else
-        ``part 1``, ... The body alone where nothing differs.
+        The points of each organ by its name, the body first (of an ear, the kernels). A slim part is a stem, a part
+        at an end of a long object a husk, a small part at an end a calyx, a part that stands off a side a leaf. Other
+        parts are ``part 1``, ... Only the body where nothing differs.
 
     Example:
         >>> cloud = read_spectral_ply("point_cloud.ply")

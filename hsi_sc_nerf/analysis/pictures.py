@@ -126,7 +126,7 @@ def draw_rows(
         path: to write.
         rows: pictures by their label.
         scales: ends and colours of the first rows' bars.
-        key: of the legend.
+        key: key of the legend.
     """
     first = next(iter(rows.values()))[0]
     width_in = 1.75

@@ -62,11 +62,11 @@ def trait_content(
     """``traits.json``: everything but spectra, in metres, square metres and litres; NaN is null.
 
     Args:
-        size: of the object.
+        size: size of the object.
         uncertainty: standard deviation of each size by its cause; empty if it was not determined.
         watertight: whether the mesh encloses a volume.
         traits: from the spectra.
-        settings: of the command.
+        settings: settings of the command.
     """
     classes = traits.classes
     relative_sd = combined(uncertainty).area_m2 / size.area_m2 if uncertainty else 0.0

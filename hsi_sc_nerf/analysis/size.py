@@ -120,7 +120,7 @@ def size_uncertainty(
 
     Args:
         points_m: the cloud.
-        normals: of the cloud.
+        normals: normals of the cloud.
         mesh: its `closed_mesh`.
         config: settings of the mesh.
         splits: pairs of halves.

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from hsi_sc_nerf import paper
 
 LEAST_POINTS = 24
-"""Of a part, and of a ring beside its edge."""
+"""Fewest points of a part, and of a ring beside its edge."""
 LARGEST = 0.5
 """Fraction of the points that a part may have: the body is the largest one."""
 _RADII = 60
@@ -44,8 +44,8 @@ def sharpest_edge(
     """The edge with the largest separation; 0 where no two rings differ by an angle that tells materials apart.
 
     Args:
-        distance: of the points from one point.
-        features: of their spectra.
+        distance: distance of the points from one point.
+        features: features of their spectra.
         rest: points that count.
         between: least and largest radius.
         largest: fraction of the points that may lie inside.

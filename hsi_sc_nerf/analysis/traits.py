@@ -69,14 +69,14 @@ class Classes:
     """A classification of the surface.
 
     Attributes:
-        names: of the classes.
+        names: names of the classes.
         labels: class of each vertex by spectral angle; -1 where it is in no class or unseen.
         threshold_rad: largest spectral angle of a class's spectra to its reference.
-        areas_m2: of each class.
+        areas_m2: areas of each class.
         unclassified_m2: seen area in no class.
         mixture_labels: class whose fraction in each vertex's spectrum, by linear unmixing, exceeds one half; -1 where
             no class does, where the spectrum is no mixture of the library's, or unseen.
-        mixture_areas_m2: of each class by ``mixture_labels``.
+        mixture_areas_m2: areas of each class by ``mixture_labels``.
         mixture_unclassified_m2: seen area in no class by ``mixture_labels``.
         regions: connected regions, in descending order of area.
     """
@@ -136,13 +136,13 @@ class RegionTraits:
     """Traits of a part of the surface: all that was seen, a class, or a region of interest.
 
     Attributes:
-        name: of the part.
+        name: name of the part.
         area_m2: on the surface.
         spectrum: reflectance of each band, of the material where it is told apart from the light.
         maps: mean of each map on the surface by name.
         reflectance_std: standard deviation of the spectrum's mean over the bands; NaN where it is not known.
         light: where the two are told apart.
-        class_areas: of each classifier by its name.
+        class_areas: areas of each classifier by its name.
     """
 
     name: str
@@ -183,10 +183,10 @@ def analyse(
     Args:
         surface: the mesh with its spectra.
         regions: of interest.
-        classes: of its vertices.
+        classes: classes of its vertices.
         pixel_m: side of a pixel on the object; None if it is not known, and with it how far means scatter.
-        maps: of the surface.
-        class_maps: of the surface.
+        maps: maps of the surface.
+        class_maps: class maps of the surface.
 
     Raises:
         InputError: two regions or maps have one name, a region holds no seen surface, or nothing was seen.

@@ -42,9 +42,9 @@ class View:
     """A rendered view: a cube of reflectance.
 
     Attributes:
-        name: of its files.
+        name: name of its files.
         rendered: what the model shows.
-        dataset: of the run.
+        dataset: dataset of the run.
     """
 
     name: str
@@ -142,8 +142,8 @@ class Run:
 
         Args:
             points_m: object frame.
-            normals: of any length, to either side. Default: those of the model's surface.
-            max_distance_m: of a point from the model's surface; points further away get NaN.
+            normals: normals of any length, to either side. Default: those of the model's surface.
+            max_distance_m: largest distance of a point from the model's surface; points further away get NaN.
             views: cameras to average over, at most.
 
         Raises:
@@ -186,7 +186,7 @@ class Run:
         """The cloud with the material's reflectance and the irradiance, as `hsi-sc-nerf material` finds them.
 
         Args:
-            cloud: of this run.
+            cloud: cloud of this run.
             correct: whether the light is taken out. Default: where shading is found beyond noise. The white reference
                 is taken to face the camera.
 

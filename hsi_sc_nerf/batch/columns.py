@@ -117,14 +117,14 @@ _LIT_REFLECTED = measured(
 )
 _REFLECTANCE_KEYS = ("mean", "std", "measured", "irradiance", "irradiance_std")
 REFLECTANCE = dict(zip(_REFLECTANCE_KEYS, (*_REFLECTED, *_LIT_REFLECTED, *_LIT), strict=True))
-"""By the key of the region's reflectance in ``traits.json``."""
+"""Columns by the key of the region's reflectance in ``traits.json``."""
 SCORES = {
     "sam": Column("sam_rad", "rad", "spectral angle of held-out views, inside the mask", "score"),
     "rmse": Column("rmse", "", "root of the mean squared error of their reflectance, inside the mask", "score"),
     "psnr": Column("psnr_db", "dB", "peak signal-to-noise ratio of them, inside the mask", "score"),
     "ssim": Column("ssim", "", "structural similarity of them, inside the mask", "score"),
 }
-"""By the key in ``eval.json``."""
+"""Columns by the key in ``eval.json``."""
 QUALITY = Column("quality", "", "worst level of inspect's and process's checks: green, amber, red", "quality", "text")
 FLAGS = Column("flags", "", "names of the checks that are not green, with semicolons between", "quality", "text")
 SECONDS = {step: Column(f"{step}_s", "s", f"wall time of the step {step}", "cost") for step in STEPS}

@@ -47,7 +47,7 @@ def write_overview(table: BatchTable, out: Path, done: Callable[[int], None] | N
     """Write the page, completely or not at all.
 
     Args:
-        table: of the batch in ``out``.
+        table: table of the batch in ``out``.
         out: where it is written to; the objects' folders lie there.
         done: called with the number of objects whose picture is made.
 

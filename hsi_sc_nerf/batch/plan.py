@@ -27,8 +27,8 @@ class PlannedObject:
 
     Attributes:
         session: folder of its captures.
-        folder: of its results.
-        settings: of its steps.
+        folder: folder of its results.
+        settings: settings of its steps.
     """
 
     session: Path
@@ -54,7 +54,7 @@ def write_plan(out: Path, rows: Sequence[Row], settings: SessionSettings, kept: 
     Args:
         out: folder of the batch.
         rows: its objects.
-        settings: of all.
+        settings: settings of all.
         kept: folder to keep the plan in instead; ``out`` stays as it is.
 
     Raises:
@@ -107,7 +107,7 @@ def outdated(objects: Mapping[str, PlannedObject], retry: bool) -> list[Path]:
     """Records of steps that are to be made again: inputs, words or results are not those of the record.
 
     Args:
-        objects: of the batch.
+        objects: objects of the batch.
         retry: also of the steps that failed.
     """
     found = []

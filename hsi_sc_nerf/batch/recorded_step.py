@@ -36,7 +36,7 @@ def record_step(one: PlannedObject, name: str, run_step: StepRunner) -> None:
 
     Args:
         one: the object.
-        name: of the step.
+        name: name of the step.
         run_step: runs its command.
     """
     before = STEPS[: STEPS.index(name)]

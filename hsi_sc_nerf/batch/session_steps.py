@@ -82,8 +82,7 @@ class SessionSettings:
     """What a user may choose of the steps."""
 
     preset: Preset = "balanced"
-    """How long to train: on two cores without a GPU fast takes about one minute, balanced five and best twenty; on a
-    GPU 10 seconds, one minute and seven."""
+    """How long to train; the times are in docs/validation/accuracy_and_time.md."""
     max_num_iterations: int | None = between(1, math.inf, default=None)
     """Training steps of both stages together, in place of the preset's."""
     num_points: int = between(1, math.inf, default=200_000)
@@ -170,7 +169,7 @@ def bring_up_to_date(step: Step, out: Path, console: Console, title: str, run_st
         step: one of `session_steps`.
         out: folder of the results.
         console: for the title and the command.
-        title: of the step.
+        title: title of the step.
         run_step: runs the command.
 
     Returns:

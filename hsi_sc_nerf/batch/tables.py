@@ -28,7 +28,7 @@ class BatchTable:
     Attributes:
         columns: in their order: of the list of sessions, then what was found.
         rows: values in the order of the columns; those of the list of sessions are texts, as they stand there.
-        reports: of each row, if there is one.
+        reports: reports of each row, if there is one.
     """
 
     columns: tuple[Column, ...]

@@ -86,7 +86,7 @@ class BenchmarkRun:
     """A configuration's finished run.
 
     Attributes:
-        name: of the configuration.
+        name: name of the configuration.
         method: nerfstudio method.
         words: as after ``ns-train METHOD``, those that all configurations share included.
         setup_seconds: wall time before the first step: reading the dataset, building the model.
@@ -135,7 +135,7 @@ class HeldOutViews:
     nerfstudio's own loader of selected views has the length of the whole dataset.
 
     Args:
-        loader: of all held-out views.
+        loader: loader of all held-out views.
         count: how many to take; None for all.
     """
 

@@ -246,8 +246,8 @@ def check_clipped(session: Session, calibration: SessionCalibration, counts: Pix
 
     Args:
         session: its bands.
-        calibration: of the session.
-        counts: of all frames.
+        calibration: calibration of the session.
+        counts: counts of all frames.
         pixels: number of pixels of all frames.
     """
     by_band = counts.saturated / pixels

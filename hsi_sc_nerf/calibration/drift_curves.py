@@ -45,9 +45,9 @@ def common_courses(
     variance of each frame's output and temperature too, whose changes noise may hide.
 
     Args:
-        covariance: of one frame's coefficients; terms with a roughness have an error of their own.
+        covariance: covariance of one frame's coefficients; terms with a roughness have an error of their own.
         basis: terms over the bands.
-        roughness: of each term, 0 for those that are not penalised.
+        roughness: roughness of each term, 0 for those that are not penalised.
     """
     root = np.linalg.cholesky(covariance)
     whitened = np.linalg.solve(root, (coefficients - coefficients.mean(axis=0)).T).T
@@ -75,7 +75,7 @@ def smoothing_basis(
     """The smoothest functions that the data distinguish, orthonormal under ``precision`` (Demmler-Reinsch basis).
 
     Args:
-        positions: of the bands, all different.
+        positions: positions of the bands, all different.
         precision: 1 / variance of each band, 0 in bands without a measurement, which are interpolated.
 
     Returns:

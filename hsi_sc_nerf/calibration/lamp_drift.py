@@ -53,7 +53,7 @@ class LampDriftEstimate:
     Attributes:
         factor: the smooth curve, which reflectance is divided by to correct the drift.
         measured: the light before smoothing; nan in bands without enough light.
-        standard_error: of ``factor``; 0 in the first frame.
+        standard_error: standard error of ``factor``; 0 in the first frame.
         static: which of the surveyed pixels are static.
         scatter: scatter of the static pixels' grey levels, sensor noise included (standard deviation, relative).
         p_value: probability of such a drift under steady lamps (`drift_p_value`).
@@ -101,7 +101,7 @@ def measure_lamp_drift(
             twice for each frame, so that one frame is in memory at a time.
         frames: number of frames.
         dark: counts without light of each frame, or one for all.
-        noise: of one reading.
+        noise: noise of one reading.
         wavelengths_nm: band centres.
         saturation_counts: counts from which a reading is saturated; None if nothing saturates.
         dead: dead detector elements.

@@ -92,7 +92,7 @@ def reflectance_uncertainty(
     The errors of a corrected lamp drift and of the panel's certificate are not included.
 
     Args:
-        noise: of one reading.
+        noise: noise of one reading.
         white_pixels: pixels of the white that were averaged.
         smoothing_bands: width of the moving average around each band; odd.
         frame_dark_readings: dark readings averaged for each element of a frame; 0 if no dark was subtracted.

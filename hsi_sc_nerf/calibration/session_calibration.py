@@ -85,12 +85,12 @@ class SessionCalibration:
         cubes: the cube that each frame is read from.
         frames: the calibration of each frame.
         bands: the bands of the files that are kept.
-        drift: of the lamps, or why it is unknown.
-        white: of the session, or of the first frame if each has its own; None for "product".
-        defects: of the detector; None for "product".
-        noise: of a reading; None for "product".
+        drift: drift of the lamps, or why it is unknown.
+        white: white of the session, or of the first frame if each has its own; None for "product".
+        defects: defects of the detector; None for "product".
+        noise: noise of a reading; None for "product".
         drift_corrected: whether the frames are divided by it.
-        uncertainty: of reflectance in the kept bands; None for "product".
+        uncertainty: uncertainty of reflectance in the kept bands; None for "product".
     """
 
     source: WhiteSource

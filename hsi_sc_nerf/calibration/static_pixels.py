@@ -59,10 +59,10 @@ class Courses:
     """Logarithm of the light of pixels over the frames, relative to each pixel's mean over the frames.
 
     Attributes:
-        log: of each bin of bands.
-        variance: of ``log`` by the sensor's noise and ``TOLERANCE``; infinite in bins that cannot be used.
-        weight: of the bins in the grey level; their sum is 1, or 0 without usable bins.
-        grey_variance: of the grey level by the sensor's noise and ``TOLERANCE``.
+        log: log of each bin of bands.
+        variance: variance of ``log`` by the sensor's noise and ``TOLERANCE``; infinite in bins that cannot be used.
+        weight: weight of the bins in the grey level; their sum is 1, or 0 without usable bins.
+        grey_variance: variance of the grey level by the sensor's noise and ``TOLERANCE``.
         judged: pixels with enough usable bins.
     """
 
@@ -148,7 +148,7 @@ def grey_deviation(
     """Deviation of static pixels' grey levels from their robust mean in each frame.
 
     Args:
-        courses: of all pixels, in reading order.
+        courses: courses of all pixels, in reading order.
         static: which of them are static.
         common: their common course.
 

@@ -137,7 +137,7 @@ def column_white(white: Cube, dark: Cube | None, samples: int, defects: Defects 
     """Steps 4 and 5 on a white cube (WHITEREF: lines of nothing but white), for each sample of the detector.
 
     Args:
-        samples: of the frames. A white of another width cannot be matched by sample and gives one column.
+        samples: samples of the frames. A white of another width cannot be matched by sample and gives one column.
 
     Raises:
         InputError: the white is not lit in half of the bands.

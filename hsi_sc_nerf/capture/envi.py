@@ -142,8 +142,8 @@ def write_cube(
 class CubeLines:
     """Context manager that reads a cube line by line, ``(samples, bands)``; each line overwrites the one before.
 
-    This is several times faster than touching new pages of a memory map, most of all with several threads. The lines
-    of a BSQ file are scattered over the file and come from a memory map.
+    This avoids touching new pages of a memory map, which is slow, most of all with several threads. The lines of a
+    BSQ file are scattered over the file and come from a memory map.
     """
 
     def __init__(self, cube: Cube) -> None:

@@ -84,9 +84,9 @@ def read_header(path: Path, library: bool = False) -> EnviHeader:
         library: whether it has to describe a spectral library, whose lines are spectra and whose samples are bands.
 
     Raises:
-        InputError: there is no such file, it is no ENVI header, a field is missing or unreadable, a list does not
-            have one number a band, the pixels would be read wrongly (complex numbers, frame offsets, compression), or
-            it describes a library where an image is expected, or the converse.
+        InputError: there is no such file, or it is no ENVI header; a field is missing or unreadable; a list does not
+            have one number a band. Or the pixels would be read wrongly (complex numbers, frame offsets, compression),
+            or the header describes a library where an image is expected, or the converse.
     """
     fields = _mended_fields(path)
     try:

@@ -34,7 +34,7 @@ class CaptureFiles:
     """Headers of one capture's cubes, and its XML.
 
     Attributes:
-        name: of the capture.
+        name: name of the capture.
         headers: by role: "counts", "dark" (DARKREF), "white" (WHITEREF), "white_dark" (WHITEDARKREF) and "product"
             (REFLECTANCE); "counts" or "product" is there.
         metadata: the instrument's XML.
@@ -175,7 +175,7 @@ class SpecimMetadata:
 
     Attributes:
         path: the file.
-        integration_time_ms: of the capture; None if it is not given.
+        integration_time_ms: integration time of the capture; None if it is not given.
         white_mode: "custom": the white was taken at another time, with its own integration time and dark;
             "simultaneous": it was taken in the capture's own frame; None if it is not given.
     """

@@ -36,7 +36,7 @@ class Capture:
     """One capture: its counts and the references that belong to them.
 
     Attributes:
-        name: of the folder or the file.
+        name: name of the folder or the file.
         cube: the raw counts, or ``product`` if there are none (``has_counts`` is False).
         dark: counts without light, at the integration time of ``cube``.
         white: WHITEREF, counts of a white.

@@ -43,8 +43,8 @@ class SessionInfo:
         direction: the turntable's direction seen from above, counter-clockwise or clockwise.
         marker_dictionary: OpenCV's name, for example ``DICT_5X5_50``.
         marker_side_m: side of a marker's black square.
-        container_diameter_m: of the upright cylinder that the object stands on.
-        container_height_m: of the cylinder's lid above the disc.
+        container_diameter_m: diameter of the upright cylinder that the object stands on.
+        container_height_m: height of the cylinder's lid above the disc.
         frame_angles_deg: the turntable's angle in each frame, for uneven, known steps.
         camera_distance_m: of the camera from the turntable's axis; sets the scale of a session without markers.
         white_reference: name of the capture of the white tarp.

@@ -36,7 +36,7 @@ class DevicePixels:
     Args:
         frames: whose packed cubes are copied to the device, as 16-bit numbers.
         masks: foreground of each frame.
-        device: of the copies.
+        device: device of the copies.
         has_flagged: whether the cubes have values that are no measurements.
     """
 
@@ -75,7 +75,7 @@ class CameraRays:
     the lens distortion of every batch anew, in a thousand small operations.
 
     Args:
-        cameras: of the frames, on the device.
+        cameras: cameras of the frames, on the device.
     """
 
     def __init__(self, cameras: Cameras) -> None:

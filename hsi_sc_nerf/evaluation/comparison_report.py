@@ -42,7 +42,7 @@ def comparison_tables(figures: Mapping[str, Any]) -> tuple[TextTable, TextTable]
     """Precision, recall and F-score at the chosen threshold and at the knee; statistics of the distances both ways.
 
     Args:
-        figures: of `comparison_summary`, or the content of ``comparison.json``.
+        figures: figures of `comparison_summary`, or the content of ``comparison.json``.
 
     Raises:
         KeyError, TypeError, ValueError: it is no such content.

@@ -40,7 +40,7 @@ LAS_MAX_DIMENSIONS = 341
 _NETCDF_BYTES = 1 << 18
 """More than names, attributes and wavelengths take in a NetCDF file."""
 _LAS_POINT_FORMAT = 7
-"""With colours."""
+"""Number of the LAS point format with colours."""
 _LAS_TEXT_RECORD = 3
 """The specification's record for a text that describes the file."""
 _LAS_NORMALS = ("NormalX", "NormalY", "NormalZ")  # CloudCompare takes these for normals

@@ -200,8 +200,8 @@ class PlyPoints:
 
     Attributes:
         content: all of its elements.
-        positions: of the points, in the file's unit.
-        triangles: of a mesh; none for a cloud.
+        positions: positions of the points, in the file's unit.
+        triangles: triangles of a mesh; none for a cloud.
     """
 
     content: PlyData

@@ -110,9 +110,9 @@ class CameraShading(nn.Module):
         """Shaded coefficients of points.
 
         Args:
-            coefficients: of the points.
-            positions: of the points, scene units; they get no gradient.
-            origins: of the rays that see the points, scene units: the camera from there.
+            coefficients: coefficients of the points.
+            positions: positions of the points, scene units; they get no gradient.
+            origins: origins of the rays that see the points, scene units: the camera from there.
         """
         with torch.no_grad():
             normals, aside = self.across_image(origins, self.normals(positions), positions - self._axis)

@@ -38,7 +38,7 @@ def sample_occupied(
     matter has samples of length 0. Gradients are not carried.
 
     Args:
-        opacity: of the cells along a side, in [0, 1]; below 0 where there is no matter.
+        opacity: opacity of the cells along a side, in [0, 1]; below 0 where there is no matter.
     """
     if origins.device.type == "cpu":
         from hsi_sc_nerf.fields import ray_marching_cpu  # compiles; a GPU does without it

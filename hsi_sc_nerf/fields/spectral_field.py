@@ -51,7 +51,7 @@ class SpectralField(NerfactoField):
             head has a linear channel for each and begins near these values. None: the direct head, whose channels
             end in a sigmoid.
         view_dependent: whether the head sees the viewing direction.
-        shading: of the coefficients, by the normal in the camera's frame; None for none.
+        shading: shading of the coefficients, by the normal in the camera's frame; None for none.
         hidden_dim_color: width of the radiance head.
         num_layers_color: layers of the radiance head.
         skip_unseen: give samples of nil weight no spectrum, unless on a GPU.
@@ -178,7 +178,7 @@ class SpectralField(NerfactoField):
 
         Args:
             draw: gives random points in scene units, and whether they lie in what is solid.
-            steps: of gradient descent.
+            steps: steps of gradient descent.
         """
         optimizer = torch.optim.Adam(self.mlp_base.parameters(), lr=1e-2, eps=1e-15)
         solid, thin = (math.log(density / self.average_init_density) for density in START_DENSITIES)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class Mesh:
     """A triangle mesh in metres; triangles run counter-clockwise seen from outside.
 
-    Area, volume and the test for holes are plain sums, many times faster than trimesh's.
+    Area, volume and the test for holes are plain sums, because trimesh's take longer.
 
     Example:
         >>> triangle = Mesh(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([[0, 1, 2]]))

@@ -57,9 +57,9 @@ _TABLE = (
     ("NDWI", "(R860 - R1240) / (R860 + R1240)", (-0.2, 0.4), "water in the tissue", "Gao 1996"),
 )  # fmt: skip
 CATALOGUE = {row[0]: SpectralIndex(*row) for row in _TABLE}
-"""By name."""
+"""The indices by name."""
 USUAL = ("NDVI", "NDVI705", "WI")
-"""Shown where a user asks for none."""
+"""Indices that are shown if the user names none."""
 _OWN = re.compile(r"\s*([A-Za-z]\w{0,29})\s*=([^=\[\]]+)(?:\[([^,\[\]]+),([^,\[\]]+)\]\s*)?", re.ASCII)
 
 

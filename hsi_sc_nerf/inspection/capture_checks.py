@@ -49,7 +49,6 @@ def check_files(session: Session, skip_damaged: bool = False) -> list[Finding]:
     """The findings ``frames``, ``damaged``, ``dates``, ``integration-times`` and ``binning``.
 
     Args:
-        session: the session.
         skip_damaged: whether the user leaves damaged captures out.
     """
     return [
@@ -168,8 +167,7 @@ def check_frames(
     """The findings ``exposure``, ``focus``, ``copies`` and ``other-object``.
 
     Args:
-        session: the session.
-        quicklooks: of its frames.
+        quicklooks: quicklooks of its frames.
         detections: markers of each frame.
     """
     return [

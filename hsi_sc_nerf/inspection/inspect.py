@@ -40,7 +40,7 @@ class Inspection:
 
     Attributes:
         session: the session, with the rotation of its images as measured.
-        quicklooks: of each frame.
+        quicklooks: quicklooks of each frame.
         markers: the markers of the frames.
         findings: results of all checks.
         session_json: content of ``session.json`` with what could be measured filled in; None for what is not known.
@@ -155,7 +155,6 @@ def check_scale(session: Session, poses: PoseMethod, scale_known: bool) -> Findi
     """The finding ``scale``: whether anything gives the scale.
 
     Args:
-        session: the session.
         poses: how poses will be found; from features or angles they may do without a scale.
         scale_known: whether something beside ``session.json`` gives it.
     """

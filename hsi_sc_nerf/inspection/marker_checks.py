@@ -51,7 +51,7 @@ class Markers:
     """The markers of a session.
 
     Attributes:
-        dictionary: of the markers; None if no marker was detected.
+        dictionary: dictionary of the markers; None if no marker was detected.
         detections: markers of each frame.
         angles_deg: the table's angle by frame, counter-clockwise from above; nan where it is not known.
         rotation_deg: rotation of the files' images from upright, counter-clockwise: 0, 90, 180 or 270; None if the

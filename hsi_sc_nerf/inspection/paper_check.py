@@ -32,8 +32,7 @@ def check_paper(session: Session, quicklooks: Sequence[Quicklook], detections: S
     """The findings ``paper``, where the session's white is a tarp, and ``veil``, where markers are large enough.
 
     Args:
-        session: the session.
-        quicklooks: of its frames.
+        quicklooks: quicklooks of its frames.
         detections: markers of each frame.
     """
     if not session.has_counts:

@@ -42,7 +42,7 @@ class Quicklook:
     """A capture by a few of its lines and bands. Pictures are oriented as in the file.
 
     Attributes:
-        name: of the capture.
+        name: name of the capture.
         picture: pseudo-RGB, about 1 on white.
         top_counts: the largest reading of the lines read.
         at_top_fraction: fraction of the readings with ``top_counts``, by band.
@@ -80,7 +80,6 @@ def quicklook_of(capture: Capture, white: Float[np.ndarray, "bands"]) -> Quicklo
     """The quicklook of one capture.
 
     Args:
-        capture: the capture.
         white: counts of a white above dark, of the same integration time.
     """
     cube = capture.cube

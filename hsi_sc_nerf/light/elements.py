@@ -89,7 +89,7 @@ def shown_points(
     """Points of the elements that pixels show: kernels of an ear shade each other and have normals of their own.
 
     Args:
-        elements: of the object and its support, which is smooth.
+        elements: elements of the object and its support, which is smooth.
         radius_m: points lie within this of their element.
         lift_m: distance of the origins of lines of sight from the surface.
 
@@ -147,7 +147,7 @@ def support_mesh(container_m: tuple[float, float] | None, disc_radius_m: float) 
 
     Args:
         container_m: its diameter and height.
-        disc_radius_m: of the disc.
+        disc_radius_m: radius of the disc.
     """
     side_m = disc_radius_m / SUPPORT_SIDES
     inner_m = 0.0 if container_m is None else container_m[0] / 2.0
@@ -189,7 +189,7 @@ def observe_elements(
     Args:
         elements: on the object and its support.
         camera_to_world: poses, OpenGL axes, metres.
-        intrinsics: of the camera.
+        intrinsics: intrinsics of the camera.
         distortion: k1, k2, p1, p2 (OpenCV).
         masks: pixels of the object.
         pixels: reads reflectance.

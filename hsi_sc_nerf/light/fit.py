@@ -39,8 +39,8 @@ BEHIND = -0.2
 """Lamps stand on the camera's side: the cosine between their direction and the camera's is above this. Two lamps in
 front of and behind a body can hardly be distinguished from one lamp and an uneven chamber."""
 SIGNIFICANT_LAMP = 30.0
-"""Squared standard deviations by which a lamp in one of 200 directions must exceed 0. On trained meshes, a lamp with
-40 % of the light reaches 600, and errors of mesh and model that resemble another lamp reach 25."""
+"""Squared standard deviations by which a lamp in one of 200 directions must exceed 0: more than errors of mesh and
+model that resemble a lamp reach (docs/validation/light.md)."""
 LEAST_LAMP = 0.02
 """Weaker lamps are removed."""
 UNEVENNESS, UNEVENNESS_COUNT = 0.03, 2.0

@@ -29,7 +29,7 @@ class ObjectLight:
     """Irradiance on an object, and its material.
 
     Attributes:
-        elements: of the object and its support.
+        elements: elements of the object and its support.
         turning: the elements as they turn under the light.
         views: measurements of them in the frames.
         fit: the light by groups of bands.
@@ -98,7 +98,7 @@ def turning_elements(
     """Cast the rays of the elements.
 
     Args:
-        elements: of the object and its support.
+        elements: elements of the object and its support.
         rotations: camera-to-object rotation of each frame.
         pixel_m: radius of the area around an element that a pixel shows.
         lift_m: distance of the rays' origins from the surface.
@@ -119,7 +119,7 @@ def light_on_object(
     """Fit the light to groups of bands, and interpolate it to all bands.
 
     Args:
-        elements: of the object and its support.
+        elements: elements of the object and its support.
         turning: the elements as they turn under the light.
         views: measurements of them in the frames.
         white_normal: outward unit normal of the white reference, camera's frame.

@@ -46,7 +46,7 @@ class RunLight:
     Attributes:
         run: the trained run.
         light: irradiance and materials.
-        evidence: of uneven light.
+        evidence: evidence of uneven light.
         renders: depth maps of the training frames.
         mesh: the object's surface, scene units.
     """
@@ -84,7 +84,6 @@ def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"]) -> RunLi
     """Fit the light on the object of a run.
 
     Args:
-        run: the trained run.
         white_normal: outward unit normal of the white reference, camera's frame (OpenGL axes).
 
     Raises:

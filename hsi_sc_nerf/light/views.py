@@ -133,7 +133,7 @@ class TurningElements:
         normals: outward unit normals, object frame.
         on_object: which of them belong to the object.
         transfer: how light reaches them.
-        directions: of the transfer's open weights, evenly spread, object frame.
+        directions: directions of the transfer's open weights, evenly spread, object frame.
         rotations: camera-to-object rotation of each frame.
     """
 

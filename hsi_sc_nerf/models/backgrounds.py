@@ -52,7 +52,7 @@ class Background(nn.Module):
             where there is no picture.
         image: reflectance; None for none.
         cell_px: side of the picture's cells, pixels of the camera's image.
-        intrinsics: of the camera.
+        intrinsics: intrinsics of the camera.
         distortion: k1, k2, p1, p2 (OpenCV).
     """
 
@@ -80,7 +80,7 @@ class Background(nn.Module):
         """Reflectance of the chamber behind rays.
 
         Args:
-            directions: of the rays as measured, before the pose refinement.
+            directions: directions of the rays as measured, before the pose refinement.
             rotations: camera-to-world rotations as measured, row by row; None for rays without a camera.
         """
         if rotations is None or self.image is None:

@@ -36,14 +36,14 @@ def build_field(
     """The spectral field, with nerfacto's settings where no other is given.
 
     Args:
-        config: of the model.
+        config: configuration of the model.
         num_bands: bands of the spectra.
         grid: size of the hash grid; None for that of the settings.
         aabb: the scene box, scene units.
         num_images: training frames.
         view_dependent: whether spectra depend on the view: by shading where there are normals and a basis, else by
             the viewing direction.
-        contraction: of unbounded space; None for a box.
+        contraction: contraction of unbounded space; None for a box.
         subspace: whose coefficients the head emits; None for the direct head.
         occupancy: gives the normals; None where proposal networks place the samples.
         turntable: axis and pose of a camera, as the data parser gives them for the pose refinement.

@@ -1,7 +1,8 @@
 """A training step's forward and backward pass as one CUDA graph.
 
-A step is some thousand small operations. Launched one by one from Python they take several times as long as the GPU
-needs to do them. Captured once, they are launched together: same operations, same random numbers, other rays.
+A step is some thousand small operations. Launching them one by one from Python takes longer than the GPU needs to do
+them (docs/validation/reconstruction.md). Captured once, they are launched together: same operations, same random
+numbers, other rays.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ class CapturedSteps:
         Args:
             kind: what else the step's operations depend on: stage, frozen parameters. Not the annealing of the
                 proposals, which is handed over by its value.
-            rays: of the batch, all of them with the same parts in every call.
+            rays: rays of the batch, all of them with the same parts in every call.
             batch: tensors on the device, likewise.
             seed: draws the step's random numbers anew; called before each pass.
         """

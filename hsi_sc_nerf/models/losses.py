@@ -96,8 +96,8 @@ def separate_distortion(
     weights are concentrated.
 
     Args:
-        weights: of the samples.
-        starts: of the samples, in order.
+        weights: weights of the samples.
+        starts: starts of the samples, in order.
         ends: likewise.
     """
     middles = (starts + ends) / 2.0
@@ -117,8 +117,8 @@ def free_space_loss(
     spectrum in front of it changes no pixel.
 
     Args:
-        weights: of the samples.
-        heights: of the samples above the support, in any unit.
+        weights: weights of the samples.
+        heights: heights of the samples above the support, in any unit.
         beside: rays through pixels that the object does not cover.
 
     Example:

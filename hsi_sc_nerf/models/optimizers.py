@@ -49,7 +49,7 @@ class Muon(torch.optim.Optimizer):
     """The momentum of a weight matrix, with all its singular values made about 1, is the step.
 
     K. Jordan et al., "Muon: An optimizer for hidden layers in neural networks", 2024. ``torch.optim.Muon`` does so in
-    bfloat16, which takes a processor six times as long.
+    bfloat16, which is slow on a processor (docs/notes/dead_ends.md).
 
     Args:
         params: weight matrices.

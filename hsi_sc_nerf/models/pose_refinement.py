@@ -58,7 +58,6 @@ class PoseRefinement(CameraOptimizer):
     """The measured poses as they are (mode off), and what all refinements have in common.
 
     Args:
-        config: the configuration.
         num_cameras: number of training cameras.
         device: where the parameters live.
         camera_to_world: pose of the first frame in scene units.

@@ -30,7 +30,7 @@ class Schedule:
         wait: finishes the work of a GPU before the clock is paused; None without one.
 
     Attributes:
-        stage: of the present step, or of the last one.
+        stage: stage of the present step, or of the last one.
         position: iterations or seconds before the present step; once it has ended, after it.
         stage_complete: whether the last step was its stage's last.
         clock: seconds of training so far.
@@ -111,7 +111,7 @@ class Schedule:
         """Go on from the `state` of a checkpoint, perhaps of another run, whose stages had other lengths.
 
         Args:
-            state: of the checkpoint.
+            state: state of the checkpoint.
             steps_done: iterations that it has.
 
         Raises:

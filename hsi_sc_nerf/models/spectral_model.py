@@ -48,7 +48,7 @@ from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.processing.spectral_subspace import training_subspace
 
 FREE_SPACE_WEIGHT = 0.01
-"""Of the loss of what is above the support beside the object (docs/validation/surface.md)."""
+"""Weight of the loss of matter above the support beside the object (docs/validation/surface.md)."""
 SUPPORT_SOFTNESS_M = 0.002
 """The support's own density reaches this far above it. Without a known container, its height is known too badly."""
 METRIC_STRIDE = 8
@@ -66,10 +66,10 @@ class SpectralModelConfig(NerfactoModelConfig):
     basis_size: int | None = None
     """Spectra in the basis of the head "basis". None: as many as stand out of the noise, at most 16."""
     effects: str = "auto"
-    """What is simulated, joined by commas: view_dependence (a point's spectrum depends on how it is turned to the
-    camera and the lamps, which stand still), still_chamber (the background is a picture of the chamber, taken
-    from the frames, instead of its median spectrum), pose_refinement (training moves the poses). none: nothing of it.
-    auto: what the dataset shows (docs/validation/effects.md)."""
+    """Effects that the model simulates, joined by commas. view_dependence: a point's spectrum depends on its turn to
+    the camera and the lamps, which stand still. still_chamber: the background is a picture of the chamber, taken from
+    the frames, instead of its median spectrum. pose_refinement: training moves the poses. none: no effect. auto: the
+    effects that the dataset shows (docs/validation/effects.md)."""
     background: Literal["chamber", "last-sample"] = "chamber"
     """Spectrum of the light that the object lets through. chamber: the chamber's. last-sample: that of the last
     sample of the ray, as in nerfacto."""

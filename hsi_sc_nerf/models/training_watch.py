@@ -63,7 +63,6 @@ class NonFiniteGuard:
         """Record a step; returns a sentence to print if it was skipped, else None.
 
         Args:
-            step: the step.
             losses: names of the loss terms that were not finite.
             groups: names of the parameter groups whose gradient was not finite.
 
@@ -98,9 +97,8 @@ class RisenLossGuard:
         """Record a step that has ended.
 
         Args:
-            step: the step.
             schedule: of the run; a stage's first loss is the one to compare with until there is a smaller median.
-            loss: of all terms; one that is not finite does not count.
+            loss: loss of all terms; one that is not finite does not count.
 
         Raises:
             TrainingDivergedError: this was the last of `MAX_RISEN_IN_A_ROW`, or the stage ends with a risen loss.

@@ -95,7 +95,7 @@ class PackedDataset:
 
     Attributes:
         root: the dataset's folder.
-        intrinsics: of the one camera.
+        intrinsics: intrinsics of the one camera.
         distortion: k1, k2, p1, p2 (OpenCV).
         wavelengths_nm: band centres.
         pseudo_rgb_nm: the three bands of the pictures.
@@ -108,10 +108,10 @@ class PackedDataset:
         flagged_values: number of values that are ``FLAGGED``, in all cubes.
         bad_bands_nm: centres of the bands that were left out because they measure nothing.
         fwhm_nm: full widths at half maximum of the bands; None if they are unknown.
-        uncertainty: of the reflectance; None if it is unknown (finished reflectance).
+        uncertainty: uncertainty of the reflectance; None if it is unknown (finished reflectance).
         typical_uncertainty: standard deviation by band at the object's mean reflectance; None likewise.
         pose_method: how the poses were estimated ("markers", "colmap", "angles"); None if that is unknown.
-        fingerprint: of the session and the settings that the dataset was made from.
+        fingerprint: fingerprint of the session and the settings that the dataset was made from.
         effects: present in the session or not, by their evidence; empty in datasets of older versions.
     """
 

@@ -70,7 +70,7 @@ class PixelSampler:
     The same seed and step give the same batch, so that a resumed run sees the batches of an uninterrupted one.
 
     Args:
-        reader: of the frames' packed cubes.
+        reader: reader of the frames' packed cubes.
         masks: foreground of each frame.
         num_rays_per_batch: pixels in a batch.
         seed: part of every batch's seed.

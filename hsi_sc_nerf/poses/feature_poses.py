@@ -116,7 +116,7 @@ def poses_from_known_camera(
     Args:
         size_px: width and height of the images.
         info: the angles and the direction.
-        camera: of the earlier session; its direction counts where ``info`` has none.
+        camera: camera of the earlier session; its direction counts where ``info`` has none.
 
     Raises:
         InputError: images of another size than the camera's, unknown angles, or an unknown direction: the poses might
@@ -162,7 +162,7 @@ def poses_from_sfm(
 
     Args:
         info: what gives the scale, the markers' dictionary, and the angles.
-        camera: of an earlier session, whose focal length and distance from the axis still hold.
+        camera: camera of an earlier session, whose focal length and distance from the axis still hold.
         hold_angles: take the known angles for exact; their direction is that of the images.
         free: what ``structure_from_motion`` finds with the camera's focal length, where it is known already.
 

@@ -143,7 +143,7 @@ def observe_expected(
     """Markers that were not detected, fitted where the turntable expects them, appended to the seen ones.
 
     Args:
-        images: of all frames; of ``SessionPictures`` the best ones.
+        images: images of all frames; of ``SessionPictures`` the best ones.
     """
     have = set(zip(seen.frame.tolist(), seen.marker.tolist(), strict=True))
     missing = [pair for pair in _facing(turntable) if pair not in have]

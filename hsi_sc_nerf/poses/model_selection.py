@@ -345,6 +345,6 @@ def f_test_evidence(ratio: float, extra: int, degrees_of_freedom: int) -> float:
     Args:
         ratio: sum of squares that ``extra`` parameters explain, over their number and the residuals' variance.
         extra: number of these parameters.
-        degrees_of_freedom: of the residuals' variance.
+        degrees_of_freedom: degrees of freedom of the residuals' variance.
     """
     return float(-np.log10(max(f_distribution.sf(ratio, extra, degrees_of_freedom), _SMALLEST_P)))

@@ -47,7 +47,7 @@ def lie_on_disc(corners: Float[np.ndarray, "m 4 3"]) -> Bool[np.ndarray, "m"]:
     """Which markers lie on the disc: the lowest group that faces up along z, the axis, and shares one height.
 
     Args:
-        corners: of each marker, in any unit, clockwise seen from its front.
+        corners: corners of each marker, in any unit, clockwise seen from its front.
     """
     right, down = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]
     normal = np.cross(down, right)
@@ -141,7 +141,7 @@ def scale_of(
     Args:
         turntable: adjusted.
         info: the markers' side, the container's diameter, the camera's distance.
-        outline: of the container, without markers.
+        outline: outline of the container, without markers.
     """
     if len(turntable.markers):
         if info.marker_side_m is not None:

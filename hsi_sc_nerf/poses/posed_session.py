@@ -49,7 +49,7 @@ def in_object_frame(
 
     Args:
         adjusted: in any unit of length.
-        outline: of the container in the same unit, which gives the disc's height.
+        outline: outline of the container in the same unit, which gives the disc's height.
         specific: what the method itself knows for ``TurntablePoses``.
     """
     source, metres = scale_of(adjusted.turntable, info, outline)
@@ -112,9 +112,9 @@ def pose_uncertainty(
     """Uncertainty of camera, angles and poses; the length that gives the scale is taken for exact.
 
     Args:
-        covariance: of its parameters (``Adjusted.covariance``).
+        covariance: covariance of its parameters (``Adjusted.covariance``).
         metres: length of its unit.
-        outline: of the container, where its radius gives the scale and its foot the disc's height.
+        outline: outline of the container, where its radius gives the scale and its foot the disc's height.
     """
     layout, turntable = adjusted.problem.layout, adjusted.turntable
     sigmas = np.sqrt(covariance.diagonal())
@@ -167,7 +167,8 @@ def _foot_gradient(adjusted: Adjusted, outline: ContainerOutline) -> Float[np.nd
 def _landmark_gradients(adjusted: Adjusted) -> tuple[Float[np.ndarray, "p"], Float[np.ndarray, "p"]]:
     """Derivatives of the disc's height, and of the log of the landmarks' distances from the axis (RMS).
 
-    By camera, angles and the rest, with all landmarks following. Markers count where there are any.
+    The derivatives are those by the camera, the angles and the other parameters; all landmarks follow. If there are
+    markers, they are the landmarks.
     """
     turntable = adjusted.turntable
     # The markers' residuals come last, where there are any.

@@ -44,7 +44,7 @@ def check_poses(poses: TurntablePoses, info: SessionInfo) -> list[Finding]:
     """Check the poses against each other and against what is known of the session.
 
     Args:
-        poses: of the session.
+        poses: poses of the session.
         info: what is known of the session: the container's size, the nominal step and the direction.
 
     Example:

@@ -26,7 +26,7 @@ class Residuals(ABC):
     """
 
     shape: tuple[int, int]
-    """Residuals of an observation and numbers of each: g, r."""
+    """Number of residuals of an observation, and number of values of each: g, r."""
     nearest: float
     """A residual is infinite if its point is nearer to the camera's plane than this, in distances of the camera."""
     hidden: Float[np.ndarray, "m 2 k"] | None = None

@@ -60,7 +60,7 @@ class FramePictures:
 
     Attributes:
         picture: the picture of a name.
-        scores: of those that are searched for markers, by name, best first (``edge_precision``).
+        scores: scores of those that are searched for markers, by name, best first (``edge_precision``).
     """
 
     picture: Callable[[str], UInt8[np.ndarray, "h w"]]

@@ -82,7 +82,7 @@ def structure_from_motion(
 
     Args:
         images: one gray image per frame in the order of the turn, all of one size.
-        focal_px: of the camera, where it is known; mapping holds it.
+        focal_px: focal length of the camera, where it is known; mapping holds it.
 
     Raises:
         InputError: nothing moves, or the object has too little texture to pose three frames.

@@ -32,8 +32,8 @@ def require_parallax(distance: float, object_distances: Float[np.ndarray, "n"]) 
     """Refuse an axis through the camera, which is found if the camera turned in its place.
 
     Args:
-        distance: of the camera from the axis.
-        object_distances: of the camera from points of the object, in the same unit.
+        distance: distance of the camera from the axis.
+        object_distances: distances of the camera from points of the object, in the same unit.
 
     Raises:
         InputError: all frames see the object from one side.

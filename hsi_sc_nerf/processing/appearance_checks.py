@@ -24,10 +24,11 @@ from hsi_sc_nerf.poses.turntable import rotations_about_z
 from hsi_sc_nerf.processing.view_changes import PointViews, facing_cell, mean_by_index
 
 LEVEL_AMBER, LEVEL_RED = 0.04, 0.15
-"""Deviation of a frame's brightness (logarithm) from the other frames. It is below 0.01 in good sessions."""
+"""Deviation of a frame's brightness (logarithm) from the other frames, above that of good sessions
+(docs/validation/masks.md)."""
 PATCH_AMBER, PATCH_RED, PATCH_TIMES = 0.06, 0.2, 3.0
 """The same for parts of a frame (root mean square over directions). It must also exceed that of a typical frame by a
-factor: noise and a rough hull cause up to 0.03."""
+factor, because noise and a rough hull change all frames."""
 LEAST_IN_PATCH = 15
 """Fewest points of a part."""
 FEW = 0.1
@@ -37,8 +38,8 @@ LEAST_FRAMES, LEAST_SHARED = 6, 200
 SLIPS_DEG = np.arange(-30.0, 30.1, 1.5)
 """Turns of the object on the disc that are tried."""
 LEAST_SLIP_DEG, SLIP_FIT = 3.0, 0.65
-"""Least angle of a slip, and the fraction of two frames' difference that may remain with it. Good sessions have 0.75
-or more: another part of a plain object may look the same by chance."""
+"""Least angle of a slip, and the fraction of two frames' difference that may remain with it. It is below that of good
+sessions, in which another part of a plain object may look the same by chance."""
 MOST_SLIPS, ONE_DIRECTION = 0.5, 0.8
 """If more of the pairs seem to slip, nearly all in one direction, the object is smooth and reflections are
 stationary."""
@@ -62,7 +63,7 @@ def check_appearance(views: PointViews, names: Sequence[str]) -> list[Finding]:
 
     Args:
         views: points of the object as the frames see them.
-        names: of all frames.
+        names: names of all frames.
 
     Example:
         >>> refuse_red(check_appearance(point_views(bins, masks, poses, lens, distortion, hull), names))
@@ -167,7 +168,7 @@ def slip_between(
 
     Args:
         views: all of them.
-        channels: of each, in units of their scatter.
+        channels: channels of each, in units of their scatter.
         first, second: rows of the two frames.
 
     Returns:
@@ -217,7 +218,7 @@ def check_band_order(
 
     Args:
         spectrum: the object's mean reflectance.
-        wavelengths_nm: of its bands.
+        wavelengths_nm: wavelengths of its bands.
 
     Example:
         >>> check_band_order(np.array([0.6, 0.1]), np.array([450.0, 900.0]))[0].level

@@ -34,11 +34,12 @@ from hsi_sc_nerf.processing.visual_hull import VotedHull
 from hsi_sc_nerf.terminal import screen_table
 
 LEAST_VIEW_CHANGE_PERCENT = 0.5
-"""On a bumpy object, poses that are wrong by a pixel cause changes of up to 0.3 %."""
+"""Least change of a point with its direction: more than wrong poses cause on a bumpy object
+(docs/validation/effects.md)."""
 LEAST_PICTURE = 0.005
 """Least gain of an image of the chamber, reflectance; the noise of a pixel is larger."""
 LEAST_HEIGHT_CHANGE_PERCENT = 2.0
-"""In even light, a colour that varies with the height, as an apple's, causes a tenth of this."""
+"""Least change with height and slope: more than a colour that varies with the height causes in even light."""
 LEAST_POSE_ERROR_PX = 0.1
 """Training corrects poses to this at best, and makes better poses worse (docs/notes/dead_ends.md)."""
 FEWEST_POINT_VIEWS = 500

@@ -65,7 +65,7 @@ def background_subspace(
     """Orthonormal basis of flat spectra and of the smallest number of components that separates the object well.
 
     Args:
-        bins: of each frame (`smoothed_bins`).
+        bins: bins of each frame (`smoothed_bins`).
         regions: pixels of each frame that may be the object's; the background is learned from the others. Without
             them it is learned from the margins on the left and on the right.
     """
@@ -99,7 +99,7 @@ def otsu_threshold(scores: Sequence[Float[np.ndarray, "h w"]]) -> tuple[float, f
     """Otsu's threshold over all frames together, and how far apart the two classes are.
 
     Args:
-        scores: of each frame, 0 or more.
+        scores: scores of each frame, 0 or more.
 
     Returns:
         The threshold; the difference of the classes' means (0 for equal scores); and that difference over the

@@ -169,7 +169,7 @@ def process_frame(
 
     Args:
         cube: raw counts, or finished reflectance.
-        fingerprint: of what the frame is made from, kept in its cache.
+        fingerprint: fingerprint of what the frame is made from, kept in its cache.
         pseudo_rgb_nm: as in `pack_frames`.
         buffer: memory to pack in (`pack_counts`), which several frames may use in turn.
 

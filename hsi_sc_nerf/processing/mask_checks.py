@@ -23,10 +23,10 @@ CUT_LINES, CUT_FRAMES = 0.05, 0.1
 fraction of the frames."""
 MAX_CONTRADICTION = 0.04
 """Largest typical difference of mask and hull's silhouette (1 - intersection over union), to which a quarter of a
-pixel along the mask's outline is added. Good masks have half of it, because the hull is found by vote."""
+pixel along the mask's outline is added. Good masks differ too, because the hull is found by vote."""
 VOTE_EXCESS = 0.015
-"""A narrow or rough object may differ by more: by so much more than the hull's silhouettes do from the hull of their
-own, which consistent masks give. Chosen on an ear of maize of 1 mm a pixel, held against pear, apple and tomato."""
+"""A narrow or rough object may differ by more. Its limit is the difference of the hull's silhouettes from the hull of
+these silhouettes, as consistent masks have it, plus this."""
 MAX_ODDITY, ODDITY_SIGMAS = 0.015, 5.0
 """Largest excess of one frame's difference over the typical one, to which an eighth of a pixel is added; and the same
 in standard deviations of the frames' differences, for noise frays masks."""
@@ -55,7 +55,7 @@ def check_masks(
     """Findings on the masks; none for good ones.
 
     Args:
-        hull: of the masks.
+        hull: hull of the masks.
         left_out: frames with a piece that its mask leaves out (`masks.foreground_masks`).
         silhouettes_of: gives those of the visual hull of other masks.
         regions: pixels that may be the object's (`masks.above_lid`), if the container is known.
@@ -207,7 +207,7 @@ def _odd(
     """Which masks contradict their silhouettes by ``excess`` more than a typical one; contradiction without noise.
 
     Args:
-        contradiction: of the masks and their silhouettes, noise included.
+        contradiction: contradiction of the masks and their silhouettes, noise included.
     """
     filled = masks.any(axis=(1, 2))
     scatter = float(median_abs_deviation(contradiction[filled], scale="normal"))

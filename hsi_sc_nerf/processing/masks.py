@@ -152,7 +152,7 @@ def foreground_mask(
     """The pieces, with thin parts that stick out of them (a woody stem). Their edges, where pixels are mixed, stay.
 
     Args:
-        pieces: of the object (`pieces_above`).
+        pieces: pieces of the object (`pieces_above`).
         region: pixels that may be the object's.
         weak_fraction: thin parts are added from this fraction of the threshold on; 1 for none.
     """
@@ -265,7 +265,7 @@ def shaded_parts(
 
     Args:
         region: pixels that may be the object's; all if not given.
-        fraction: of the object's median ratio of score and brightness, from which a pixel belongs to it.
+        fraction: fraction of the object's median ratio of score and brightness, from which a pixel belongs to it.
 
     Returns:
         The pixels to add, none where the background, of the frame and beside the pixel, is dark.
@@ -290,7 +290,7 @@ def at_half_coverage(
     """The mask with its edge where pixels are half object, judged by the score of the object beside them.
 
     Args:
-        brightness: of one frame. A pixel in shade is kept: its score is low because it is dark.
+        brightness: brightness of one frame. A pixel in shade is kept: its score is low because it is dark.
         may_grow: pixels that may be added.
 
     Returns:

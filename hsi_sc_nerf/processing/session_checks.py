@@ -41,7 +41,7 @@ class SessionChecks:
     """Collects the findings of one step after the other.
 
     Args:
-        inspection: of the session before anything was computed; its findings are the first.
+        inspection: inspection of the session before anything was computed; its findings are the first.
         accepted: names of checks whose red findings the user accepts.
         output_dir: the dataset.
 

@@ -26,7 +26,7 @@ NORMAL_CELLS = 6
 MOST_CHANGE = 1.0
 """Relative changes are limited to this: larger ones come from pixels of the chamber in a wrong mask."""
 ALIKE = 12
-"""The brightness of a point is compared with that of this many others, those with the most similar spectra."""
+"""Number of points with the most similar spectra that the brightness of a point is compared with."""
 _RIDGE = 1e-6
 _LEAST_RIDGE = 1e-12
 COLOURS = 6
@@ -164,10 +164,10 @@ class PointViews:
     Attributes:
         point: number of the point.
         frame: number of the frame.
-        normal: of the point in the camera's frame: right, up, towards the camera.
+        normal: normal of the point in the camera's frame: right, up, towards the camera.
         reflectance: by colour.
-        positions_m: of the points, object frame.
-        normals: of the points, object frame.
+        positions_m: positions of the points, object frame.
+        normals: normals of the points, object frame.
     """
 
     point: Int[np.ndarray, "n"]

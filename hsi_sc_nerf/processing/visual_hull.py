@@ -49,7 +49,7 @@ class VotedHull:
     Attributes:
         core: centres of the voxels that hardly any mask contradicts (`MAX_MISSED_FRACTION`), object
             frame, metres; n may be 0.
-        sides_m: of a voxel.
+        sides_m: sides of a voxel.
         voxel_px: diameter of a voxel in the images, odd.
         silhouettes: pixels of each frame that see the hull.
         core_silhouettes: pixels of each frame that see the core.
@@ -82,7 +82,7 @@ def voted_hull(
 
     Args:
         camera_to_worlds: poses, OpenGL axes.
-        intrinsics: of the one camera; lens distortion is neglected.
+        intrinsics: intrinsics of the one camera; lens distortion is neglected.
         min_z_m: height of the container's lid, below which the hull does not reach; None if unknown.
 
     Example:
@@ -164,7 +164,7 @@ def silhouette_counts(points: Any, masks: Iterable[Any], pixels_of: Callable[[in
 
     Args:
         points: (n, 3), in the unit that ``pixels_of`` takes.
-        masks: of each frame (lines, samples), true on the object.
+        masks: masks of each frame (lines, samples), true on the object.
         pixels_of: of a frame's index and points, which points lie in the image (n), and their pixels (n, 2) as
             (sample, line), (0, 0) where they do not.
     """

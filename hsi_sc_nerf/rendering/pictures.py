@@ -123,7 +123,7 @@ class FalseColour:
     """A composite or an index as a picture.
 
     Attributes:
-        name: of the composite or the index.
+        name: name of the composite or the index.
         legend: what the colours mean.
         colours: turns a view into a picture, colours in [0, 1].
     """

@@ -155,7 +155,7 @@ def cloud_payload(
 
     Args:
         cloud: the points to show (`points_of_page`).
-        spectra: of the same points.
+        spectra: spectra of the same points.
         indices: to offer, as `find_indices` reads them.
         calibrations: to offer; of a classifier the classes, and the probability of each.
 

@@ -33,7 +33,7 @@ class HeldOutView:
     """A held-out view in the report.
 
     Attributes:
-        scores: of the view.
+        scores: scores of the view.
         measured_rgb: reflectance in the bands of pseudo-RGB.
         rendered_rgb: likewise.
         points: spectra around some points of the object.
@@ -81,7 +81,7 @@ class ViewScores:
     """Scores of one held-out view; those by band are of the object's pixels.
 
     Attributes:
-        name: of the capture.
+        name: name of the capture.
         metrics: `spectral_metrics` of the object, and with the prefix ``full_`` of the whole frame.
         rmse: root mean square error a band, reflectance; NaN for a band that was measured nowhere on the object.
         psnr_db: peak signal-to-noise ratio a band; likewise.
@@ -155,8 +155,8 @@ class PixelSpectra:
     """Spectra of the object's pixels within a circle around a point of a view.
 
     Attributes:
-        line: of its centre.
-        sample: of its centre.
+        line: line of its centre.
+        sample: sample of its centre.
         pixels: how many pixels of the object lie in the circle.
         measured: mean reflectance a band; NaN where a band was measured in none of the pixels.
         measured_sd: standard deviation over the pixels, noise and texture together.

@@ -68,7 +68,7 @@ class Figure:
     pictures: Sequence[Markup]
     caption: str
     titles: Sequence[str] = ()
-    """Of each picture, where they have any."""
+    """Titles of the pictures, where they have any."""
     columns: int = 1
     """Number of pictures side by side on a wide screen."""
 

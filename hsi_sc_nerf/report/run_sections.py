@@ -130,8 +130,8 @@ def settings_section(settings: Mapping[str, str], defaults: Mapping[str, str], m
     """Settings of the run, machine and package versions.
 
     Args:
-        settings: of the run (`flat_settings`).
-        defaults: of its method.
+        settings: settings of the run (`flat_settings`).
+        defaults: defaults of its method.
         machine: facts of the machine that makes the report, and versions of its packages.
     """
     changed = [

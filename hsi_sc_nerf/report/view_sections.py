@@ -40,7 +40,7 @@ _METRICS = {
     "ssim_windowed": ("SSIM, 11 px windows", "{:.3f}"),
 }
 _NO_SCORE = "no score"
-"""Of a view that shows nothing of the object that was measured."""
+"""Text in place of the score of a view without a measured pixel of the object."""
 _MARK_RGB = (213, 94, 0)
 _MARKED_PX = 480
 # Half of the angle that tells two materials apart, and that angle.

@@ -203,7 +203,7 @@ class Reflection:
         """Light that has been reflected since it left the surface, by colour.
 
         Args:
-            colours: of the leaving light.
+            colours: colours of the leaving light.
             leaving: weights of these colours at each point.
             materials: fraction of each material at each point.
         """

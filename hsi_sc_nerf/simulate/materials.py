@@ -57,7 +57,7 @@ class Measured:
     wavelengths_nm: tuple[float, ...]
     """Increasing."""
     reflectance: tuple[float, ...]
-    """In [0, 1]."""
+    """Reflectance, in [0, 1]."""
 
 
 Material: TypeAlias = PlantTissue | Plain | Measured

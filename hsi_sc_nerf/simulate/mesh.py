@@ -73,7 +73,7 @@ def cylinder(diameter_m: float, height_m: float, segments: int = 128, spacing_m:
     """A closed upright cylinder that stands on z = 0.
 
     Args:
-        diameter_m: of the circle through its vertices, metres.
+        diameter_m: diameter of the circle through its vertices, metres.
         height_m: metres.
         spacing_m: largest distance between rings of vertices, metres; None gives rings at the two rims only.
     """

@@ -39,7 +39,7 @@ class FrameView:
     Attributes:
         visible: whether the point is in the image and in the mask, faces the camera, and nothing occludes it.
         beside_mask: the same for points beside the mask.
-        cosines: of the angle between the point's normal and the direction to the camera.
+        cosines: cosines of the angle between the point's normal and the direction to the camera.
         xy_px: image coordinates (x, y) from the upper left corner; undefined behind the camera.
         pixels: (sample, line) of the point; (0, 0) outside the image.
     """
@@ -57,7 +57,7 @@ class DepthRenders:
 
     Attributes:
         camera_to_world: refined poses (OpenGL axes).
-        intrinsics: of the one camera.
+        intrinsics: intrinsics of the one camera.
         distortion: k1, k2, p1, p2 (OpenCV).
         depths: distance from the camera to the surface at each cell's centre; infinite where a ray hits nothing, NaN
             where no ray was rendered.

@@ -53,7 +53,6 @@ def outline_opacity(run: TrainedRun, rays_per_batch: int) -> float:
     Pixels in front of the turntable are left out: their background receives light from the object and turns with it.
 
     Args:
-        run: the trained run.
         rays_per_batch: rays rendered at a time.
 
     Example:

@@ -145,7 +145,7 @@ def densities_along(
 
     Args:
         model: trained model, in evaluation mode.
-        origins: of the rays.
+        origins: origins of the rays.
         directions: unit vectors.
         edges: distances that bound the steps, ascending.
     """

@@ -147,8 +147,8 @@ def even_points(
     The fraction of the candidates that are kept gives the number to try next. Surplus points are left out at random.
 
     Args:
-        vertices: of the mesh.
-        triangles: of the mesh.
+        vertices: vertices of the mesh.
+        triangles: triangles of the mesh.
         count: points to return; there are fewer if hardly any candidate is kept.
         keep: turns candidates on the mesh into as many or fewer points.
         max_batch: candidates at a time.

@@ -49,8 +49,8 @@ def scale_bar(camera: CameraHandle, centre: Float[np.ndarray, "3"], units_per_m:
     It hangs near the camera and is smaller by as much, so that it looks as it would at the centre's depth.
 
     Args:
-        camera: of the browser: its place, turn, vertical field of view (rad) and width over height.
-        centre: of the object, scene.
+        camera: camera of the browser: its place, turn, vertical field of view (rad) and width over height.
+        centre: centre of the object, scene.
         units_per_m: of the scene.
     """
     right, down, ahead = SO3(np.asarray(camera.wxyz)).as_matrix().T

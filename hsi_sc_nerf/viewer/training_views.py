@@ -88,7 +88,7 @@ def frame_pixels(
     Args:
         directions: in the world.
         rotation: the frame's camera-to-world rotation, OpenGL axes.
-        intrinsics: of the frame.
+        intrinsics: intrinsics of the frame.
         distortion: k1, k2, p1, p2 (OpenCV).
     """
     turned = in_camera_frame(directions, rotation.reshape(9).expand(*directions.shape[:-1], 9))

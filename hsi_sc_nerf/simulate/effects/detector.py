@@ -312,4 +312,4 @@ EFFECTS: tuple[type[Effect], ...] = (
     ReadNoise,
     BadPixels,
 )
-"""In the order in which they act."""
+"""The effects in the order in which they act."""

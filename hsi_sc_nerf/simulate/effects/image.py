@@ -259,4 +259,4 @@ EFFECTS: tuple[type[Effect], ...] = (
     OpticalBlur,
     ImageRotation,
 )
-"""In the order in which they act."""
+"""The effects in the order in which they act."""

@@ -186,4 +186,4 @@ def _at_normal(refractive_index: float) -> float:
 
 
 EFFECTS: tuple[type[Effect], ...] = (ChamberShading, InterReflection, Lamp, Gloss)
-"""In the order in which they act."""
+"""The effects in the order in which they act."""

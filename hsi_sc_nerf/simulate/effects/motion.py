@@ -228,4 +228,4 @@ EFFECTS: tuple[type[Effect], ...] = (
     MissingFrames,
     OffCentre,
 )
-"""In the order in which they act."""
+"""The effects in the order in which they act."""
