@@ -60,7 +60,7 @@ def test_a_list_of_the_users_is_not_replaced(tmp_path):
     (tmp_path / "session").mkdir()
     own = tmp_path / LIST_NAME
     own.write_text("object;session\n")
-    with pytest.raises(InputError, match=r"sessions\.csv: is not of a batch and would be replaced"):
+    with pytest.raises(InputError, match=r"sessions\.csv: is not of a batch"):
         plan(tmp_path, pear=tmp_path / "session")
     assert own.read_text() == "object;session\n"
     assert not (tmp_path / SETTINGS_NAME).exists()

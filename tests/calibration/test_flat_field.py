@@ -125,8 +125,8 @@ def test_brightness_is_of_the_elements_in_use():
 def test_tarp_that_cannot_tell(tmp_path):
     tarp = tarp_capture(tmp_path, exposed(light(0.2, 0.0), tarp_reflectance(False), 0))
     white = white_reference(tarp)
-    with pytest.raises(InputError, match=r"tarp\.hdr: its \(96, 96\) lines and samples differ from the \(48, 96\)"):
+    with pytest.raises(InputError, match=r"tarp\.hdr: its \(96, 96\) .* \(48, 96\)"):
         flat_field(tarp, white, (48, 96))
     small = white_reference(tarp, (40, 40, 52, 52))
-    with pytest.raises(InputError, match=r"tarp\.hdr: the tarp is too small in its image"):
+    with pytest.raises(InputError, match=r"tarp\.hdr: the tarp is too small"):
         flat_field(tarp, small, (SIZE, SIZE))

@@ -216,7 +216,7 @@ def test_white_that_is_lit_in_few_bands_is_refused(tmp_path):
     counts[..., :3] = 10.0
     assert white_reference(capture(tmp_path, "white", counts, dark)).bad_bands.sum() == 3
     counts[..., 3] = 10.0
-    with pytest.raises(InputError, match=r"white\.hdr: the white can be used in 3 of its 7 bands only"):
+    with pytest.raises(InputError, match=r"white\.hdr: .* 3 of its 7 bands"):
         white_reference(capture(tmp_path, "white", counts, dark))
 
 

@@ -70,7 +70,7 @@ def test_wavelengths_from_elsewhere(header, listed):
     np.testing.assert_array_equal(open_cube(header, WAVELENGTHS_NM).wavelengths_nm, WAVELENGTHS_NM)
     with pytest.raises(InputError, match=r"cube\.hdr: gives no wavelengths; .*band_centres"):
         open_cube(header)
-    with pytest.raises(InputError, match=r"no wavelengths, and 3 band centres do not fit"):
+    with pytest.raises(InputError, match=r"3 band centres do not fit"):
         open_cube(header, WAVELENGTHS_NM[:3])
 
 
@@ -175,7 +175,7 @@ def test_full_disk_leaves_the_old_cube(header, monkeypatch):
 
     before = sorted(header.parent.iterdir())
     monkeypatch.setattr(spy, "write_envi_header", fill_the_disk)
-    with pytest.raises(InputError, match=r"cube\.raw: cannot be written \(No space left on device\)"):
+    with pytest.raises(InputError, match=r"cube\.raw: .*\(No space left on device\)"):
         write_cube(header, some_cube() + 1, wavelengths_nm=WAVELENGTHS_NM)
     assert sorted(header.parent.iterdir()) == before
     np.testing.assert_array_equal(open_cube(header).read(), some_cube())

@@ -256,7 +256,7 @@ def test_a_frame_that_no_white_can_serve(tmp_path):
     for name in ("1", "2", "white_reference"):
         write_capture(tmp_path, name, white=False, product=False)
     write_capture(tmp_path, "3", counts=False, white=False)
-    with pytest.raises(InputError, match=r"REFLECTANCE_3\.hdr: there are no raw counts of this frame"):
+    with pytest.raises(InputError, match=r"REFLECTANCE_3\.hdr: there are no raw counts"):
         open_session(tmp_path)
 
 

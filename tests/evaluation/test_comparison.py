@@ -127,7 +127,7 @@ def test_a_mesh_against_itself_in_millimetres_is_exact(mesh: Path, tmp_path: Pat
     assert max(found.to_reference_m.max(), found.to_cloud_m.max()) < 1e-6
     with pytest.raises(InputError, match=r"1e\+03 times as large as .* \(--reference-unit"):
         compared(mesh, tmp_path / "mm.stl", CompareConfig(align="none", points=2000))
-    with pytest.raises(InputError, match=r"mm\.stl: is 1e\+03 times as large as .* the cloud has to be in metres"):
+    with pytest.raises(InputError, match=r"mm\.stl: is 1e\+03 times as large.* in metres"):
         compared(tmp_path / "mm.stl", mesh, CompareConfig(align="none", points=2000))
 
 
@@ -143,7 +143,7 @@ def test_icp_brings_a_shifted_cloud_back(mesh: Path, tmp_path: Path) -> None:
 def test_a_symmetric_shape_is_said_to_be_one(mesh: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = Registration(Similarity(), 0.001, Rival(90.0, 0.0001, 0.0001))
     monkeypatch.setattr(comparison, "align_by_features", lambda *_: found)
-    with pytest.raises(InputError, match=r"turned by 90 degrees it fits as well .* --align icp"):
+    with pytest.raises(InputError, match=r"turned by 90 degrees.* --align icp"):
         compared(mesh, mesh, CompareConfig(points=500))
     accepted = compared(mesh, mesh, CompareConfig(points=500, accept_symmetric=True))
     write_comparison(tmp_path / "out", accepted, "cloud", "reference")
@@ -188,5 +188,5 @@ def test_a_folder_without_truth_and_a_cloud_too_thin_to_align(mesh: Path, sessio
     with pytest.raises(InputError, match="as for a simulated session"):
         compared(mesh, session, CompareConfig(with_scale=True))
     thin = write_cloud(tmp_path / "thin.ply", on_ball(20))
-    with pytest.raises(InputError, match=r"thin\.ply: has 20 points, too few to align by"):
+    with pytest.raises(InputError, match=r"thin\.ply: has 20 points, too few"):
         compared(thin, mesh, CompareConfig(points=500))

@@ -35,7 +35,7 @@ def test_las_holds_everything_as_extra_bytes(tmp_path: Path) -> None:
 def test_las_refuses_more_bands_than_it_holds(tmp_path: Path) -> None:
     pytest.importorskip("laspy")
     write_cloud(tmp_path / "fits", stream(random_cloud(2, np.linspace(400.0, 1000.0, 336))), "las")
-    with pytest.raises(InputError, match=r"cloud\.las: LAS has room for 336 bands and the cloud has 337.*--bands"):
+    with pytest.raises(InputError, match=r"cloud\.las: .* 336 bands.* 337.*--bands"):
         require_format(tmp_path / "cloud", "las", 337, 2)
 
 

@@ -128,7 +128,7 @@ def test_another_cube_is_not_taken_for_a_packed_one(dataset, interleave, dtype):
     frame = dataset.frames[0]
     cube = np.ones((4, 5, 3), dtype)
     write_cube(frame.cube_path, cube, wavelengths_nm=WAVELENGTHS_NM, interleave=interleave, data_suffix=".bip")
-    with pytest.raises(InputError, match=r"a\.hdr: is not a BIP cube of 16-bit numbers"):
+    with pytest.raises(InputError, match=r"a\.hdr: .* BIP cube of 16-bit numbers"):
         frame.cube()
 
 
