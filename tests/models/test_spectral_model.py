@@ -39,6 +39,7 @@ def test_decoding_commutes_with_compositing(device):
     torch.testing.assert_close(once, (weights * decoder(coefficients)).sum(-2), rtol=1e-5, atol=2e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [True, False])
 def test_free_space_counts_only_above_a_support_of_known_height(known, tiny_dataset, tmp_path):
     data = tmp_path / "data"
