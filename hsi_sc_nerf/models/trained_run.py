@@ -17,6 +17,7 @@ from hsi_sc_nerf.models.checkpoints import find_checkpoint, require_model
 from hsi_sc_nerf.models.run_settings import read_config, require_method
 from hsi_sc_nerf.models.spectral_model import SpectralModel, SpectralModelConfig
 from hsi_sc_nerf.packed.dataset import PackedDataset
+from hsi_sc_nerf.packed.of_run import find_dataset
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,12 +99,11 @@ def open_trained_run(load_config: Path) -> TrainedRun:
 def _relocated(config: TrainerConfig, load_config: Path) -> TrainerConfig:
     """Settings with the paths of where the run lies now; it may have been moved since training.
 
-    Checkpoints are looked for beside the file, a dataset with a relative path from the run's folder upwards.
+    Checkpoints are looked for beside the file, the dataset by `find_dataset`.
     """
     config.output_dir = load_config.parent
     config.experiment_name = config.method_name = config.timestamp = "."
     manager = config.pipeline.datamanager
-    if manager.data is not None and not manager.data.exists():
-        above = (folder / manager.data for folder in load_config.resolve().parents)
-        manager.data = next((data for data in above if data.exists()), manager.data)
+    if manager.data is not None:
+        manager.data = find_dataset(manager.data, load_config) or manager.data
     return config

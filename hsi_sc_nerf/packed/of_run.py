@@ -21,15 +21,25 @@ def require_dataset_of_run(load_config: Path) -> None:
         InputError: the dataset is not there.
     """
     named = _named_dataset(load_config)
-    if named is None:
-        return
-    # A relative path is that of the folder in which the training was started.
-    places = [named, *(folder / named for folder in load_config.resolve().parents)]
-    if not any(transforms_path(place).is_file() for place in places):
+    if named is not None and find_dataset(named, load_config) is None:
         raise InputError(
             f"{load_config}: was trained on the packed dataset {named}, which is not there; put it back, or call the "
             "command in the folder that the training was started in."
         )
+
+
+def find_dataset(named: Path, load_config: Path) -> Path | None:
+    """Where a run's dataset lies now, None if it is not there.
+
+    A relative path is that of the folder in which the training was started: it is looked for from the working folder,
+    then from the run's folder upwards.
+
+    Args:
+        named: path of the dataset in the run's settings.
+        load_config: the run's ``config.yml``.
+    """
+    candidates = (named, *(folder / named for folder in load_config.resolve().parents))
+    return next((path for path in candidates if transforms_path(path).is_file()), None)
 
 
 def _named_dataset(load_config: Path) -> Path | None:
