@@ -117,5 +117,9 @@ def composite(
 
     Raises:
         InputError: a wavelength has no band near it; the message names the composite.
+
+    Example:
+        >>> composite(np.array([0.1, 0.2, 0.3]), np.array([450.0, 550.0, 650.0]), (650.0, 550.0, 450.0)).tolist()
+        [0.3, 0.2, 0.1]
     """
     return spectra[..., require_bands(wavelengths_nm, rgb_nm, name).tolist()]

@@ -120,6 +120,7 @@ def test_python_blocks_run(page: str, text: str, folder: Path) -> None:
         "analysis.preprocessing.preprocessed",
         "api.clouds.read_cloud",
         "evaluation.comparison.read_reference",
+        "evaluation.spectral_metrics.spectral_metrics",
         "evaluation.spatial.precision_recall_f_score",
         "export.cloud.comment_lines",
         "export.cloud.read_spectral_ply",
@@ -138,6 +139,7 @@ def test_python_blocks_run(page: str, text: str, folder: Path) -> None:
         "numerics.spectral_angle",
         "robust_scatter.robust_std",
         "robust_scatter.tukey_weights",
+        "spectra.composite",
         "surface.surface_depth.opacity_crossing_depth",
     ],
 )

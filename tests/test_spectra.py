@@ -44,7 +44,7 @@ def test_wavelengths_without_a_band_near_them_are_refused():
     visible = np.arange(400.0, 701.0, 5.0)
     assert covered(visible, (400.0, 551.0, 710.0)).all()
     assert covered(visible, (400.0, 551.0, 710.5)).tolist() == [True, True, False]
-    with pytest.raises(InputError, match="NDVI needs .* 800 nm, .* 61 bands .* 400 to 700 nm"):
+    with pytest.raises(InputError, match=r"NDVI needs .* 800 nm, .* 61 bands .* 400 to 700 nm"):
         index_values(CATALOGUE["NDVI"], np.ones((1, 61)), visible)
     with pytest.raises(InputError, match="near 980 and another near 850 nm"):
         require_bands(visible, (980.0, 850.0, 550.0), "a picture")

@@ -172,6 +172,10 @@ def calibration_map(surface: SpectralMesh, calibration: Calibration) -> SurfaceM
 
     Raises:
         InputError: the calibration needs wavelengths that the surface's bands do not reach.
+
+    Example:
+        >>> dry_matter = calibration_map(surface, read_calibration("dry_matter.csv"))
+        >>> np.nanmean(dry_matter.values)
     """
     nm = surface.wavelengths_nm
     of = partial(calibration.of, nm=nm)

@@ -57,6 +57,10 @@ def find_components(surface: SpectralMesh, most: int) -> Components:
 
     Raises:
         InputError: too little of the surface was seen.
+
+    Example:
+        >>> components = find_components(surface, most=4)
+        >>> components.endmembers.names
     """
     seen = np.flatnonzero(surface.seen)
     spectra = surface.spectra[seen].astype(float)

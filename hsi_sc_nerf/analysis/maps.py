@@ -63,6 +63,10 @@ def index_maps(surface: SpectralMesh, indices: Sequence[SpectralIndex]) -> list[
 
     Raises:
         InputError: a wavelength of an index has no band near it.
+
+    Example:
+        >>> (ndvi,) = index_maps(surface, find_indices(["NDVI"], surface.wavelengths_nm))
+        >>> np.nanmedian(ndvi.values)
     """
     maps = []
     for index in indices:

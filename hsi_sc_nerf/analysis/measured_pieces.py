@@ -94,6 +94,10 @@ def write_pieces(folder: Path | str, pieces: Sequence[Measurement], name: str, p
 
     Raises:
         InputError: the files cannot be written.
+
+    Example:
+        >>> pieces = measure_pieces(read_spectral_ply(Path("point_cloud.ply")))
+        >>> write_pieces("traits", pieces, "point_cloud.ply")
     """
     folder = Path(folder)
     if len(pieces) == 1:

@@ -183,13 +183,13 @@ def analyse(
     Args:
         surface: the mesh with its spectra.
         regions: of interest.
-        classes: classes of its vertices.
         pixel_m: side of a pixel on the object; None if it is not known, and with it how far means scatter.
-        maps: maps of the surface.
-        class_maps: class maps of the surface.
 
     Raises:
         InputError: two regions or maps have one name, a region holds no seen surface, or nothing was seen.
+
+    Example:
+        >>> analyse(surface, maps=index_maps(surface, indices)).regions[0].spectrum.mean
     """
     chosen: dict[str, Bool[np.ndarray, "v"]] = {WHOLE: surface.seen}
     if not surface.seen.any():

@@ -47,6 +47,11 @@ def spectral_metrics(
     Omega, however the pixels lie. It asks whether the object's contrast is right as a whole; ``ssim_windowed`` asks
     whether details are in place (`windowed_scores`). ``rmse_pixel_mean``, the mean of each pixel's root, is what
     the paper's released code prints; it is never above ``rmse``, the text's, where all is valid.
+
+    Example:
+        >>> measured = torch.full((16, 16, 4), 0.5)
+        >>> round(spectral_metrics(measured + 0.1, measured)["rmse"], 3)
+        0.1
     """
     return metrics_of_regions(predicted, target, {"": mask}, valid)
 

@@ -153,7 +153,7 @@ def test_other_bands_are_resampled_with_the_error_of_linear_interpolation(tmp_pa
 
 def test_a_calibration_beyond_the_bands_is_refused(fitted):
     spectra, _ = simulated(5)
-    with pytest.raises(InputError, match="needs 400 to 1000 nm.* 400 to 900 nm"):
+    with pytest.raises(InputError, match=r"needs 400 to 1000 nm.* 400 to 900 nm"):
         calibration_map(surface_of(spectra[:, :51], NM[:51]), read_calibration(fitted))
 
 
@@ -175,7 +175,7 @@ def test_models_of_scikit_learn_as_onnx(tmp_path, capfd, model, column, rtol):
     calibration = read_calibration(table(tmp_path / "own.csv", head, {"wavelength_nm": NM[:6]}))
     np.testing.assert_allclose(calibration.values(expected[:, :6]), expected[:, column], rtol=rtol)
     assert calibration.name == "own"
-    with pytest.raises(InputError, match="no ONNX model .* 7 bands"):
+    with pytest.raises(InputError, match=r"no ONNX model .* 7 bands"):
         read_calibration(table(tmp_path / "own.csv", head, {"wavelength_nm": NM[:7]}))
     names_in_latin_1 = (
         (MODELS / model).read_bytes().replace(b"variable", b"variabl\xe9").replace(b"label", b"lab\xe9l")

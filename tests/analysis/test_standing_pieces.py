@@ -60,7 +60,7 @@ def test_each_object_is_measured_by_itself(tmp_path):
     cloud = cloud_of(points, normals)
     with pytest.raises(InputError, match=r"2 objects.*--piece 1 to --piece 2"):
         measure_traits(cloud, mesh=CONFIG, splits=0)
-    with pytest.raises(InputError, match="--piece is 3.* choose 1 to 2"):
+    with pytest.raises(InputError, match=r"--piece is 3.* choose 1 to 2"):
         one_piece(cloud, 3, CONFIG)
     regions = {"top of the small": (-0.06, 0, STAND_M + 1.2 * RADIUS_M, 0.01)}
     measured = measure_pieces(cloud, mesh=CONFIG, splits=0, regions=regions)

@@ -243,7 +243,7 @@ def test_points_seen_too_obliquely_or_without_a_spectrum_give_none(spectrum, inc
     assert not found.seen[points[:, 1] < -0.002].any()
     assert found.seen[~left].all()
     assert with_spectra(surface.mesh, cloud, 0.001).seen.all() == np.isfinite(spectrum)
-    with pytest.raises(InputError, match="no point .* at 60 degrees or less"):
+    with pytest.raises(InputError, match=r"no point .* at 60 degrees or less"):
         with_spectra(surface.mesh, cloud, 0.001, max_incidence_deg=60.0)
     with pytest.raises(InputError, match="no point of the cloud has a spectrum"):
         with_spectra(surface.mesh, replace(cloud, spectra=np.full_like(spectra, np.nan)), 0.001)

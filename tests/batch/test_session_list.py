@@ -94,7 +94,7 @@ def test_a_session_may_come_twice_with_other_settings(table):
 
 def test_a_folder_of_sessions_is_a_list(table, tmp_path):
     (tmp_path / "notes").mkdir()
-    with pytest.raises(InputError, match="'b, c' cannot be .* name it in a CSV"):
+    with pytest.raises(InputError, match=r"'b, c' cannot be .* name it in a CSV"):
         read_sessions(tmp_path)
     (tmp_path / "b, c").rename(tmp_path / "b-c")
     assert [row["object"] for row in read_sessions(tmp_path)] == ["a", "b-c"]

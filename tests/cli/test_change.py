@@ -162,15 +162,15 @@ def test_bad_input_is_one_sentence_and_nothing_is_written(clouds, tmp_path):
     write_spectral_ply(other, type(cloud)(*list(vars(cloud).values())[:3], cloud.spectra[:, :4], NM[:4]))
     with pytest.raises(InputError, match="2 other: has other bands than 1 monday"):
         ChangeCommand((first, other), out).main()
-    with pytest.raises(InputError, match="repeat point_cloud is .* 1 monday"):
+    with pytest.raises(InputError, match=r"repeat point_cloud is .* 1 monday"):
         ChangeCommand((first, clouds / "friday"), out, repeat=first / "point_cloud.ply").main()
     copied = tmp_path / "tuesday.ply"
     copied.write_bytes((first / "point_cloud.ply").read_bytes())
-    with pytest.raises(InputError, match="2 tuesday is .* 1 monday"):
+    with pytest.raises(InputError, match=r"2 tuesday is .* 1 monday"):
         ChangeCommand((first, copied), out).main()
-    with pytest.raises(InputError, match="--piece has 3 numbers.* or 2"):
+    with pytest.raises(InputError, match=r"--piece has 3 numbers.* or 2"):
         ChangeCommand((first, clouds / "friday"), out, piece=(1, 2, 1)).main()
-    with pytest.raises(InputError, match="2 friday: --piece is 2.* holds 1"):
+    with pytest.raises(InputError, match=r"2 friday: --piece is 2.* holds 1"):
         ChangeCommand((first, clouds / "friday"), out, piece=(1, 2)).main()
     with pytest.raises(InputError, match="session-std"):
         ChangeCommand((first, other), out, session_std=-1.0).main()

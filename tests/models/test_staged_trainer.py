@@ -153,9 +153,7 @@ def test_a_run_that_keeps_failing_stops_with_its_last_good_weights(tiny_dataset,
 def test_a_run_whose_loss_rises_and_stays_there_stops_with_the_checkpoint_before(tiny_dataset, tmp_path):
     made = trainer(tiny_dataset, tmp_path, max_num_iterations=60, steps_per_save=5)
     poison(made, range(15, 60), factor=30.0)
-    with pytest.raises(
-        SystemExit, match=r"^hsi-sc-nerf: step 29: [^\n]*last good checkpoint [^\n]*\.$"
-    ):
+    with pytest.raises(SystemExit, match=r"^hsi-sc-nerf: step 29: [^\n]*last good checkpoint [^\n]*\.$"):
         made.train()
     (checkpoint,) = made.checkpoint_dir.glob("*.ckpt")
     assert 10 <= torch.load(checkpoint)["step"] < 20
