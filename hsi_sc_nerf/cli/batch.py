@@ -11,6 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from socket import gethostname
 from tempfile import TemporaryDirectory
+from uuid import uuid4
 
 import tyro
 from rich.console import Console
@@ -136,20 +137,11 @@ def _lock(out: Path) -> Iterator[None]:
     Raises:
         InputError: another batch has it, or the folder cannot be written to.
     """
-    path, owner = out / _LOCKS / "plan.lock", f"{gethostname()} {os.getpid()}\n"
+    path, owner = out / _LOCKS / "plan.lock", f"{gethostname()} {os.getpid()} {uuid4()}\n"
     made = [folder for folder in (path.parent, path.parent.parent, out) if not folder.exists()]
-    make_folder(path.parent)
     try:
-        # Only one of two machines on a shared folder succeeds with it.
-        with path.open("x", encoding="utf-8") as file:
-            file.write(owner)
-    except FileExistsError as error:
-        raise _taken(out) from error
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be written ({error.strerror}); free some space or choose another folder."
-        ) from error
-    try:
+        make_folder(path.parent)
+        _claim(path, owner, out)
         yield
     finally:
         # Snakemake removes all locks at its end; by now this one can be that of the next batch.
@@ -159,6 +151,20 @@ def _lock(out: Path) -> Iterator[None]:
         for folder in made:
             with suppress(OSError):
                 folder.rmdir()
+
+
+def _claim(path: Path, owner: str, out: Path) -> None:
+    """Write the lock, which only one of two machines on a shared folder succeeds with."""
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(owner)
+    except FileExistsError as error:
+        raise _taken(out) from error
+    except OSError as error:
+        path.unlink(missing_ok=True)  # begun on a full disk, it would keep all later batches out
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror}); free some space or choose another folder."
+        ) from error
 
 
 def _taken(out: Path) -> InputError:

@@ -130,6 +130,13 @@ def test_two_started_at_once_do_not_harm_each_other(tmp_path, monkeypatch, comma
     assert not list(out.rglob("*.lock"))
 
 
+def test_a_full_disk_leaves_no_lock(tmp_path, limit_of_files):
+    sessions = make_sessions(tmp_path / "sessions", ["a"])
+    with limit_of_files(1), pytest.raises(InputError, match=r"plan\.lock: cannot be written"):
+        BatchCommand(sessions=sessions, output_dir=tmp_path / "out").main()
+    assert not (tmp_path / "out").exists()
+
+
 def test_what_is_refused_leaves_no_lock_and_no_folder(tmp_path, monkeypatch):
     sessions = make_sessions(tmp_path / "sessions", ["a"])
     inside = sessions / "a" / "out"
