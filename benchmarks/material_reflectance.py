@@ -14,6 +14,10 @@ With a run, all is as in `hsi-sc-nerf material`: the trained surface, the poses 
 the cloud's spectra. A point's true spectrum is that of the nearest point of the true surface. The true irradiance is
 that of the pixel which shows the point most from the front.
 
+With ``--light``, the light is taken from the file that `hsi-sc-nerf material` wrote for another object:
+
+    uv run python benchmarks/material_reflectance.py MAIZE "maize" --light APPLE/cloud-material.json
+
 The white reference of a session with a lamp faces the lamp, which is the simulator's convention.
 """
 
@@ -41,7 +45,8 @@ from hsi_sc_nerf.light.elements import (
     support_mesh,
 )
 from hsi_sc_nerf.light.fit import WHITE_STD
-from hsi_sc_nerf.light.material import light_on_object, turning_elements
+from hsi_sc_nerf.light.known_light import KnownLight, read_light
+from hsi_sc_nerf.light.material import centre_in_camera, light_on_object, turning_elements
 from hsi_sc_nerf.light.of_run import ShadingEvidence, light_of_run, shading_evidence
 from hsi_sc_nerf.light.views import ElementViews
 from hsi_sc_nerf.models.trained_run import open_trained_run
@@ -89,16 +94,20 @@ class MaterialReflectance:
     """The config.yml of a run that was trained on the session, to be judged instead of the true mesh."""
     cloud: Path | None = None
     """The cloud that was exported from it."""
+    light: Path | None = None
+    """NAME-material.json of another session, whose light is taken."""
     results: Path = RESULTS
     """Folder of the CSV file."""
 
     def main(self) -> None:
         """Measure, and write the table's row."""
         truth = load_truth(self.session)
+        known = None if self.light is None else read_light(self.light)
         if self.config is not None and self.cloud is not None:
-            kind, judged = "trained", judge_run(truth, self.config, self.cloud)
+            kind, judged = "trained", judge_run(truth, self.config, self.cloud, known)
         else:
-            kind, judged = "true mesh", judge_true_mesh(truth, container_of(self.session), even=self.even)
+            container_m = container_of(self.session)
+            kind, judged = "true mesh", judge_true_mesh(truth, container_m, known, even=self.even)
         row = [self.name, kind, *judged.cells()]
         write_results("material_reflectance", COLUMNS, [row], keys=2, folder=self.results)
 
@@ -159,7 +168,9 @@ class Judged:
         ]
 
 
-def judge_true_mesh(truth: Truth, container_m: tuple[float, float], *, even: bool) -> Judged:
+def judge_true_mesh(
+    truth: Truth, container_m: tuple[float, float], known: KnownLight | None, *, even: bool
+) -> Judged:
     """The light on the true mesh."""
     mesh, poses = truth.mesh(), truth.camera_to_world
     corners = np.concatenate(list(truth.marker_layout.values()))
@@ -187,7 +198,9 @@ def judge_true_mesh(truth: Truth, container_m: tuple[float, float], *, even: boo
     facing = np.array([0.0, 0.0, 1.0]) if even else facing_of(truth)
     started = time.process_time()
     turning = turning_elements(elements, poses[:, :3, :3], SMOOTHING_M, LIFT_M)
-    found = light_on_object(elements, turning, views, facing)
+    if known is not None:
+        known = known.at(centre_in_camera(elements, poses), truth.wavelengths_nm)
+    found = light_on_object(elements, turning, views, facing, known)
     evidence = shading_evidence(turning, views, found.spectral)
     seconds = time.process_time() - started
 
@@ -204,11 +217,11 @@ def judge_true_mesh(truth: Truth, container_m: tuple[float, float], *, even: boo
     return Judged(evidence, points.positions[point], measured, true, irradiance, std, shown, seconds)
 
 
-def judge_run(truth: Truth, config: Path, cloud_path: Path) -> Judged:
+def judge_run(truth: Truth, config: Path, cloud_path: Path, known: KnownLight | None) -> Judged:
     """The light on a run's surface, and the spectra of its cloud."""
     run, cloud = open_trained_run(config), read_spectral_ply(cloud_path)
     started = time.process_time()
-    found = light_of_run(run, facing_of(truth))
+    found = light_of_run(run, facing_of(truth), known)
     seconds, surface = time.process_time() - started, TrueObject.of(truth)
     frontal = np.flatnonzero(cloud.extra[INCIDENCE] < LARGEST_INCIDENCE_DEG)
     chosen = np.random.default_rng(0).choice(frontal, min(2 * POINTS, len(frontal)), replace=False)

@@ -14,7 +14,19 @@ FRAMES, RADIUS_M, ELEVATION = 12, 0.04, 0.4
 
 def turning_ball(count: int = 300, centres_m: np.ndarray | float = 0.0) -> TurningElements:
     """Elements of a ball that sees no other, or parts of such balls about some centres, before a turning camera."""
-    normals = even_directions(count)
+    return _turning(even_directions(count), centres_m)
+
+
+def upright_post(count: int = 300) -> TurningElements:
+    """Elements of an upright cylinder, likewise."""
+    azimuth = 2.0 * np.pi * np.arange(count) / count
+    heights_m = np.random.default_rng(4).uniform(-0.06, 0.06, count)
+    normals = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(count)], axis=1)
+    return _turning(normals, heights_m[:, None] * np.array([0.0, 0.0, 1.0]))
+
+
+def _turning(normals: np.ndarray, centres_m: np.ndarray | float) -> TurningElements:
+    count = len(normals)
     cosines = np.maximum(normals @ DIRECTIONS.T, 0.0)
     transfer = Transfer(
         (cosines / cosines.sum(axis=1, keepdims=True)).astype(np.float32), scipy.sparse.csr_array((count, count))

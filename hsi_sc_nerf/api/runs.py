@@ -20,6 +20,7 @@ from hsi_sc_nerf.export.sample_points import PointSpectra, sample_points
 from hsi_sc_nerf.export.spectral_export import density_normals, render_cloud
 from hsi_sc_nerf.indices.catalogue import find_indices
 from hsi_sc_nerf.indices.formula import index_values
+from hsi_sc_nerf.light.known_light import read_light
 from hsi_sc_nerf.light.of_run import light_of_run
 from hsi_sc_nerf.models import trained_run
 from hsi_sc_nerf.packed.dataset import PackedDataset
@@ -182,19 +183,23 @@ class Run:
         names = ", ".join(one.capture for one in self.dataset.frames)
         raise InputError(f"the session has no frame {frame}; it has {names}.")
 
-    def with_material(self, cloud: SpectralCloud, correct: bool | None = None) -> Cloud:
+    def with_material(
+        self, cloud: SpectralCloud, correct: bool | None = None, light: Path | str | None = None
+    ) -> Cloud:
         """The cloud with the material's reflectance and the irradiance, as `hsi-sc-nerf material` finds them.
 
         Args:
             cloud: cloud of this run.
             correct: whether the light is taken out. Default: where shading is found beyond noise. The white reference
                 is taken to face the camera.
+            light: NAME-material.json of another object in the same chamber, whose light is taken.
 
         Raises:
-            InputError: the cloud has other bands, or the light cannot be told.
+            InputError: the cloud or the light has other bands, or the light cannot be told.
         """
         require_bands_of_run(cloud, self.wavelengths_nm, "the cloud")  # before the work
-        found = light_of_run(self.trained, _TO_CAMERA)
+        known = None if light is None else read_light(Path(light))
+        found = light_of_run(self.trained, _TO_CAMERA, known)
         corrected = found.evidence.shaded if correct is None else correct
         return Cloud.of(with_material(cloud, found, self.wavelengths_nm, corrected=corrected))
 

@@ -43,8 +43,14 @@ class MaterialCommand:
     correct: Literal["auto", "always", "never"] = "auto"
     """Whether to correct the light. auto: where shading is found beyond noise. never: the material's columns hold
     what was measured."""
+    light: Path | None = None
+    """File NAME-material.json of another object, whose light is taken instead of being found on this one. The object
+    must have stood in the same chamber, before the same camera and with the same white reference; best is a round,
+    matte body without gloss, captured once for each chamber. An object with upright sides alone, such as an ear of
+    maize, does not show how high a lamp stands."""
     white_azimuth_deg: float = between(-90.0, 90.0, default=0.0)
-    """Direction that the white reference faced, degrees: 0 is to the camera, positive is to the right of it."""
+    """Direction that the white reference faced, degrees: 0 is to the camera, positive is to the right of it. Not used
+    with --light, whose session had its own."""
     white_elevation_deg: float = between(-90.0, 90.0, default=0.0)
     """The same above the optical axis of the camera."""
 
@@ -60,6 +66,7 @@ class MaterialCommand:
         from hsi_sc_nerf.export.cloud_material import require_bands_of_run, with_material
         from hsi_sc_nerf.export.formats import format_of, require_format, write_cloud
         from hsi_sc_nerf.files import require_writable, write_json
+        from hsi_sc_nerf.light.known_light import read_light
         from hsi_sc_nerf.light.of_run import light_of_run
         from hsi_sc_nerf.models.trained_run import open_trained_run
 
@@ -69,9 +76,10 @@ class MaterialCommand:
         cloud = read_spectral_ply(self.cloud)
         extra = {*cloud.extra, *LIGHT_COLUMNS, *band_property_names(cloud.wavelengths_nm, "material")}
         require_format(stem, file_format, len(cloud.wavelengths_nm), len(extra))
+        known = None if self.light is None else read_light(self.light)
         run = open_trained_run(self.load_config)
         require_bands_of_run(cloud, run.model.wavelengths_nm, str(self.cloud))
-        found = light_of_run(run, self._white_normal())
+        found = light_of_run(run, self._white_normal(), known)
         corrected = self.correct == "always" or (self.correct == "auto" and found.evidence.shaded)
         result = with_material(cloud, found, run.model.wavelengths_nm, corrected=corrected)
         told = light_summary(found, result, corrected=corrected)
@@ -107,19 +115,12 @@ def sentences(told: dict[str, Any]) -> list[str]:
 
 def light_summary(found: RunLight, cloud: SpectralCloud, *, corrected: bool) -> dict[str, Any]:
     """The light, what tells of it, and its median uncertainty in a cloud `with_material`, ready for JSON."""
-    light, (irradiance, std) = found.light.fit.light, (cloud.extra[name] for name in LIGHT_COLUMNS)
+    irradiance, std = (cloud.extra[name] for name in LIGHT_COLUMNS)
     return {
         "corrected": corrected,
         "shaded": found.evidence.shaded,
         "evidence": asdict(found.evidence),
         "relative_std": float(np.median(std / irradiance)) if np.isfinite(std).all() else None,
         "scatter": found.light.fit.scatter,
-        "light": {
-            "chamber_harmonics": light.chamber.tolist(),
-            "lamps": light.lamps.tolist(),
-            "to_lamps": light.to_lamps.tolist(),
-            "lamps_distance_m": 1.0 / light.nearness if light.nearness else None,
-            "chamber_colour": light.chamber_colour.tolist(),
-            "lamp_colour": light.lamp_colour.tolist(),
-        },
+        "light": found.stationary.values(),
     }

@@ -11,15 +11,14 @@ chamber, few lamps, and irradiance 1 on the white reference.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-import scipy.sparse
 from jaxtyping import Float
-from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.geometry.camera import unit_vectors
-from hsi_sc_nerf.light.shared_errors import CORRELATED, SMALLEST_SCATTER, SharedErrors, scatter_beyond
+from hsi_sc_nerf.light.materials import LightFit, MaterialFitting
+from hsi_sc_nerf.light.shared_errors import CORRELATED, SharedErrors
 from hsi_sc_nerf.light.stationary_light import (
     DEGREE_OF_TERM,
     TERMS,
@@ -29,8 +28,7 @@ from hsi_sc_nerf.light.stationary_light import (
     tangents,
     unit_irradiance,
 )
-from hsi_sc_nerf.light.views import ElementViews, LampUnits, TurningElements
-from hsi_sc_nerf.robust_scatter import robust_std, tukey_weights
+from hsi_sc_nerf.light.views import ElementViews, TurningElements
 
 MOST_LAMPS = 4
 CANDIDATES = 200
@@ -61,35 +59,11 @@ COLOUR_STD = 0.3
 """Expected scatter of the lamps' colour from the white reference's light."""
 LEAST_LAMPS = 0.05
 """The lamps' colour is fitted if they give the white reference at least this fraction of its light."""
-OCCLUSION_ERROR = 0.1
-"""Error of irradiance relative to the part that neighbours occlude: meshes are uncertain where bodies touch."""
 STEPS, LEAST_STEPS = 10, 3
 """Steps of Gauss-Newton for each number of lamps."""
 SETTLED = 0.01
 """Squared standard deviations of a step at which the fit has converged."""
 LARGEST_TURN_RAD = 0.2
-LEAST_IRRADIANCE = 0.02
-
-
-@dataclass(frozen=True, eq=False)
-class LightFit:
-    """The light and the materials that fit the views best.
-
-    Attributes:
-        light: in the camera's frame.
-        material: reflectance of each element; that of the nearest one for an element without a view.
-        weights: Tukey's weight of each measurement, 0 to 1.
-        irradiance: at each measurement.
-        scatter: robust standard deviation of the measurements relative to the model.
-        relative_std: relative standard deviation of each measurement's irradiance due to the light's uncertainty.
-    """
-
-    light: StationaryLight
-    material: Float[np.ndarray, "n bands"]
-    weights: Float[np.ndarray, "m"]
-    irradiance: Float[np.ndarray, "m bands"]
-    scatter: float
-    relative_std: Float[np.ndarray, "m"]
 
 
 def fit_light(elements: TurningElements, views: ElementViews, white_normal: Float[np.ndarray, "3"]) -> LightFit:
@@ -116,31 +90,19 @@ def fit_light(elements: TurningElements, views: ElementViews, white_normal: Floa
     fit.unevenness = UNEVENNESS
     fit.errors = SharedErrors(elements.cells[views.element], elements.facing(views))
     fit.converge(estimate_unevenness=True)
-    return fit.result()
+    return fit.result(fit.covariance())
 
 
-class _LightFitting:
+class _LightFitting(MaterialFitting):
     """State of the fit: the light, and what follows from it."""
 
     def __init__(self, elements: TurningElements, views: ElementViews, white: np.ndarray) -> None:
-        self.elements, self.views, self.white = elements, views, white
-        count = len(views.element), len(elements.positions)
-        entries = np.ones(count[0]), (views.element, np.arange(count[0]))
-        self._sum_by_element = scipy.sparse.csr_array(entries, shape=count[::-1])
-        seen = np.bincount(views.element, minlength=count[1]) > 0
-        self._nearest_seen = np.flatnonzero(seen)[cKDTree(elements.positions[seen]).query(elements.positions)[1]]
-        self._chamber = elements.chamber_at(views)
+        super().__init__(elements, views, even_chamber(views.reflectance.shape[1]))
+        self.white = white
         self.errors = SharedErrors(elements.cells[views.element])
-        occluded = 1.0 - elements.transfer.sky[views.element]
-        self._own_std = np.hypot(views.own_std, OCCLUSION_ERROR * occluded)
-        self._precision = np.zeros(count[0])
-        self.light = even_chamber(views.reflectance.shape[1])
-        self.weights, self.scatter = np.ones(count[0]), 0.0
         self.unevenness = UNEVENNESS_AT_FIRST
-        self.bounced = np.zeros((count[0], views.reflectance.shape[1]), np.float32)
-        self.lamps = elements.lamps_at(views, self.light.to_lamps)
 
-    _STATE = ("light", "lamps", "weights", "scatter", "unevenness", "bounced", "_precision")
+    _STATE = ("light", "lamps", "weights", "scatter", "unevenness", "bounced", "precision")
 
     def state(self) -> dict:
         """What `restore` needs."""
@@ -154,11 +116,11 @@ class _LightFitting:
     def converge(self, *, estimate_unevenness: bool = False) -> None:
         """Gauss-Newton with the present lamps; the chamber's unevenness is estimated as well on request."""
         for number in range(STEPS):
-            self._bounce()
-            residual, jacobian = self._linearised()
-            self._weigh(residual)
-            residual, jacobian = self._without_materials(residual[:, None], jacobian)
-            information, known = self.errors.information(residual[:, 0], jacobian, self._precision)
+            self.bounce()
+            residual, jacobian = self.linearised()
+            self.weigh(residual)
+            residual, jacobian = self.without_materials(residual[:, None], jacobian)
+            information, known = self.errors.information(residual[:, 0], jacobian, self.precision)
             prior, pull = self._prior()
             hessian = information + prior
             step = np.linalg.solve(hessian, known + pull)
@@ -171,24 +133,24 @@ class _LightFitting:
 
     def add_lamp(self) -> bool:
         """Add the lamp that explains most of the residuals; False if none is significant."""
-        self._bounce()
+        self.bounce()
         directions = even_directions(CANDIDATES)
         directions = directions[directions[:, 2] > BEHIND]
         units = self.elements.lamps_at(self.views, directions).irradiance
-        residual, jacobian = self._linearised()
+        residual, jacobian = self.linearised()
         expected = 1.0 / self.irradiance().mean(axis=1, keepdims=True)
-        residual, columns, others = self._without_materials(residual[:, None], units * expected, jacobian)
-        precision = self._precision[:, None]
+        residual, columns, others = self.without_materials(residual[:, None], units * expected, jacobian)
+        precision = self.precision[:, None]
         # The part that chamber and lamps can explain is removed.
         hessian = (others * precision).T @ others + CORRELATED * self._prior()[0]
         known = np.linalg.solve(hessian, (others * precision).T @ np.hstack([residual, columns]))
         residual, *columns = (np.hstack([residual, columns]) - others @ known).T
         columns = np.stack(columns, axis=-1)
-        significance = self.errors.significance(residual, columns, self._precision)
+        significance = self.errors.significance(residual, columns, self.precision)
         best = int(significance.argmax())
         if significance[best] < SIGNIFICANT_LAMP:
             return False
-        weighted = columns[:, best] * self._precision
+        weighted = columns[:, best] * self.precision
         strength = (weighted @ residual) / (weighted @ columns[:, best])
         light = self.light
         self._set(
@@ -200,82 +162,13 @@ class _LightFitting:
         )
         return True
 
-    def result(self) -> LightFit:
-        """The result, with the light's uncertainty."""
-        self._bounce()
-        residual, full = self._linearised()
-        residual, jacobian = self._without_materials(residual[:, None], full)
-        information, _ = self.errors.information(residual[:, 0], jacobian, self._precision)
-        covariance = np.linalg.inv(information + self._prior()[0])
-        variance = np.einsum("mi,ij,mj->m", full, covariance, full)
-        irradiance = self.irradiance()
-        return LightFit(
-            self.light, self._materials(irradiance), self.weights, irradiance, self.scatter, np.sqrt(variance)
-        )
-
-    def irradiance(self) -> Float[np.ndarray, "m bands"]:
-        """At the measurements."""
-        chamber, lamps = self._direct()
-        light = self.light
-        total = chamber[:, None] * light.chamber_colour + lamps[:, None] * light.lamp_colour + self.bounced
-        return np.maximum(total, LEAST_IRRADIANCE)
-
-    def _direct(self) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m"]]:
-        """Irradiance at the measurements by chamber and lamps, without their colours."""
-        light, units = self.light, self.lamps
-        return self._chamber @ light.chamber, (units.irradiance + light.nearness * units.by_nearness) @ light.lamps
-
-    def _bounce(self) -> None:
-        """Irradiance at the measurements by other elements, from the light and materials of now."""
-        for _ in range(1 if self.bounced.any() else 2):
-            material = self._materials(self.irradiance())
-            bounced = np.zeros_like(self.bounced)
-            for frame in np.unique(self.views.frame):
-                rows = np.flatnonzero(self.views.frame == frame)
-                arriving = self.elements.bounced(self.light, material, int(frame))
-                bounced[rows] = arriving[self.views.element[rows]]
-            self.bounced = bounced
-
-    def _materials(self, irradiance: np.ndarray) -> Float[np.ndarray, "n bands"]:
-        """The reflectance of each element that fits its measurements best."""
-        above = self._sum_by_element @ (self.weights[:, None] * self.views.reflectance * irradiance)
-        below = self._sum_by_element @ (self.weights[:, None] * irradiance**2)
-        return np.clip((above / np.maximum(below, 1e-9))[self._nearest_seen], 1e-4, 1.0)
-
-    def _linearised(self) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m parameters"]]:
-        """Relative residuals, and relative derivatives of the expected values by the light's parameters.
-
-        Both are means over the bands, weighted by the square of the expected reflectance. The parameters are the
-        chamber's harmonics, the lamps, their directions along two tangents, and their nearness if there are lamps.
-        """
-        light, irradiance = self.light, self.irradiance()
-        expected = self._materials(irradiance)[self.views.element] * irradiance
-        band_weights = expected**2 / (expected**2).sum(axis=1, keepdims=True)
-        residual = (band_weights * (self.views.reflectance / expected - 1.0)).sum(axis=1)
-        by_chamber = (band_weights * light.chamber_colour / irradiance).sum(axis=1)[:, None]
-        by_lamps = (band_weights * light.lamp_colour / irradiance).sum(axis=1)[:, None]
-        units: LampUnits = self.lamps
-        columns = [self._chamber * by_chamber, (units.irradiance + light.nearness * units.by_nearness) * by_lamps]
-        if len(light.lamps):
-            turning = (units.by_direction * light.lamps[:, None]).reshape(len(band_weights), -1)
-            columns += [turning * by_lamps, (units.by_nearness @ light.lamps)[:, None] * by_lamps]
-        return residual, np.hstack(columns)
-
-    def _without_materials(self, *columns: np.ndarray) -> list[np.ndarray]:
-        """Columns without their weighted mean over each element's views, which its material absorbs."""
-        total = np.maximum(self._sum_by_element @ self.weights, 1e-9)[:, None]
-        means = ((self._sum_by_element @ (self.weights[:, None] * column)) / total for column in columns)
-        return [column - mean[self.views.element] for column, mean in zip(columns, means, strict=True)]
-
-    def _weigh(self, residual: Float[np.ndarray, "m"]) -> None:
-        """Find the scatter and the measurements' weights."""
-        used = self.views.shows_light
-        self.scatter = float(robust_std(residual[used], least=SMALLEST_SCATTER))
-        beyond = scatter_beyond(residual[used], self._own_std[used])
-        std = np.hypot(beyond, self._own_std)
-        # Never 0, so that no element is left without a measurement.
-        self.weights = np.where(used, np.maximum(tukey_weights(residual / std), 1e-6), 1.0)
-        self._precision = self.weights * used / std**2
+    def covariance(self) -> Float[np.ndarray, "parameters parameters"]:
+        """Of the light's parameters."""
+        self.bounce()
+        residual, jacobian = self.linearised()
+        residual, jacobian = self.without_materials(residual[:, None], jacobian)
+        information, _ = self.errors.information(residual[:, 0], jacobian, self.precision)
+        return np.linalg.inv(information + self._prior()[0])
 
     def _prior(self) -> tuple[np.ndarray, np.ndarray]:
         """Precision of the parameters' prior, and its gradient at their present values."""
@@ -293,6 +186,9 @@ class _LightFitting:
         of_chamber, of_lamps = unit_irradiance(self.white, light.to_lamps)
         white = np.zeros(len(precision))
         white[:TERMS], white[TERMS : TERMS + lamps] = of_chamber, of_lamps
+        # A lamp that turns gives the white reference another light.
+        lit = light.lamps * (light.to_lamps @ self.white > 0.0)
+        white[TERMS + lamps : TERMS + 3 * lamps] = (lit[:, None] * (tangents(light.to_lamps) @ self.white)).ravel()
         missing = 1.0 - of_chamber @ light.chamber - of_lamps @ light.lamps
         outer = np.outer(white, white) / WHITE_STD**2
         return np.diag(precision) + outer, white * missing / WHITE_STD**2 - precision * now
@@ -333,11 +229,11 @@ class _LightFitting:
         if of_lamps < LEAST_LAMPS * (of_chamber + of_lamps):
             return
         irradiance = self.irradiance()
-        expected = self._materials(irradiance)[self.views.element] * irradiance
-        chamber, lamps = self._direct()
+        expected = self.materials(irradiance)[self.views.element] * irradiance
+        chamber, lamps = self.direct()
         slope = (lamps - chamber * of_lamps / of_chamber)[:, None] / irradiance
-        residual, slope = self._without_materials(self.views.reflectance / expected - 1.0, slope)
-        weighted = self._precision[:, None] / CORRELATED * slope
+        residual, slope = self.without_materials(self.views.reflectance / expected - 1.0, slope)
+        weighted = self.precision[:, None] / CORRELATED * slope
         gain = (weighted * slope).sum(axis=0) + COLOUR_STD**-2
         step = ((weighted * residual).sum(axis=0) + (1.0 - light.lamp_colour) * COLOUR_STD**-2) / gain
         # A change that all bands share is one of the lamps' strength.

@@ -10,7 +10,9 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.light.elements import NORMAL_WEIGHT, Elements, shown_points
-from hsi_sc_nerf.light.fit import LEAST_IRRADIANCE, OCCLUSION_ERROR, LightFit, fit_light
+from hsi_sc_nerf.light.fit import fit_light
+from hsi_sc_nerf.light.known_light import KnownLight
+from hsi_sc_nerf.light.materials import LEAST_IRRADIANCE, OCCLUSION_ERROR, LightFit, materials_under
 from hsi_sc_nerf.light.stationary_light import even_directions
 from hsi_sc_nerf.light.views import ElementViews, TurningElements, transfer
 
@@ -92,6 +94,13 @@ class ObjectLight:
         return of_light + (OCCLUSION_ERROR * occluded) ** 2 + (UNEXPLAINED * self.fit.scatter) ** 2
 
 
+def centre_in_camera(elements: Elements, camera_to_object: Float[np.ndarray, "frames 4 4"]) -> Float[np.ndarray, "3"]:
+    """The object's centre in the camera's frame, metres: the mean over the frames, if it does not lie on the axis."""
+    centre_m = elements.positions[elements.on_object].mean(axis=0)
+    rotations, eyes_m = camera_to_object[:, :3, :3], camera_to_object[:, :3, 3]
+    return np.einsum("fkj,fk->fj", rotations, centre_m - eyes_m).mean(axis=0)
+
+
 def turning_elements(
     elements: Elements, rotations: Float[np.ndarray, "frames 3 3"], pixel_m: float, lift_m: float
 ) -> TurningElements:
@@ -114,7 +123,11 @@ def turning_elements(
 
 
 def light_on_object(
-    elements: Elements, turning: TurningElements, views: ElementViews, white_normal: Float[np.ndarray, "3"]
+    elements: Elements,
+    turning: TurningElements,
+    views: ElementViews,
+    white_normal: Float[np.ndarray, "3"],
+    known: KnownLight | None = None,
 ) -> ObjectLight:
     """Fit the light to groups of bands, and interpolate it to all bands.
 
@@ -123,11 +136,22 @@ def light_on_object(
         turning: the elements as they turn under the light.
         views: measurements of them in the frames.
         white_normal: outward unit normal of the white reference, camera's frame.
+        known: light that is taken as it is, at the object's centre and the bands of the views. Only the materials are
+            found.
     """
     bands = views.reflectance.shape[1]
     groups = np.array_split(np.arange(bands), min(BAND_GROUPS, bands))
     means = np.stack([views.reflectance[:, group].mean(axis=1) for group in groups], axis=-1)
-    fit = fit_light(turning, replace(views, reflectance=means), white_normal)
+    grouped = replace(views, reflectance=means)
+    if known is None:
+        fit = fit_light(turning, grouped, white_normal)
+    else:
+        of_chamber, of_lamps = (
+            np.array([colour[group].mean() for group in groups])
+            for colour in (known.light.chamber_colour, known.light.lamp_colour)
+        )
+        light = replace(known.light, chamber_colour=of_chamber, lamp_colour=of_lamps)
+        fit = materials_under(light, known.covariance, turning, grouped)
     at = np.array([group.mean() for group in groups])
     # Linear between the groups' middles, constant beyond the outermost.
     between = np.stack([np.interp(np.arange(bands), at, column) for column in np.eye(len(at))], axis=-1)

@@ -17,8 +17,9 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import CERTAIN
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.light.elements import observe_elements, spread_elements, support_mesh
-from hsi_sc_nerf.light.fit import LightFit
-from hsi_sc_nerf.light.material import ObjectLight, light_on_object, turning_elements
+from hsi_sc_nerf.light.known_light import KnownLight
+from hsi_sc_nerf.light.material import ObjectLight, centre_in_camera, light_on_object, turning_elements
+from hsi_sc_nerf.light.materials import LightFit
 from hsi_sc_nerf.light.views import ElementViews, TurningElements
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.packed.cube import unpack
@@ -46,6 +47,7 @@ class RunLight:
     Attributes:
         run: the trained run.
         light: irradiance and materials.
+        stationary: the light itself, at the bands of the run.
         evidence: evidence of uneven light.
         renders: depth maps of the training frames.
         mesh: the object's surface, scene units.
@@ -53,6 +55,7 @@ class RunLight:
 
     run: TrainedRun
     light: ObjectLight
+    stationary: KnownLight
     evidence: ShadingEvidence
     renders: DepthRenders
     mesh: SurfaceMesh
@@ -80,14 +83,15 @@ class RunLight:
         return frames.cpu().numpy(), xy_px.cpu().numpy(), normals
 
 
-def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"]) -> RunLight:
+def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"], known: KnownLight | None = None) -> RunLight:
     """Fit the light on the object of a run.
 
     Args:
         white_normal: outward unit normal of the white reference, camera's frame (OpenGL axes).
+        known: light of another session in the same chamber, which is taken instead; the white reference is its own.
 
     Raises:
-        InputError: the run holds no object, or no frame sees enough of it.
+        InputError: the run holds no object, no frame sees enough of it, or the known light has other bands.
 
     Example:
         >>> found = light_of_run(open_trained_run(Path("config.yml")), np.array([0.0, 0.0, 1.0]))
@@ -108,6 +112,9 @@ def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"]) -> RunLi
     elements = spread_elements(scanned, support, ELEMENTS, SUPPORT_ELEMENTS, SMOOTHING_M)
     poses = renders.camera_to_world.cpu().numpy().astype(float)
     poses[:, :3, 3] = run.to_metres(poses[:, :3, 3])
+    centre_m = centre_in_camera(elements, poses)
+    if known is not None:
+        known = known.at(centre_m, run.model.wavelengths_nm)
 
     def pixels(frame: int, lines: np.ndarray, samples: np.ndarray) -> np.ndarray:
         reflectance, valid = unpack(
@@ -121,8 +128,10 @@ def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"]) -> RunLi
             "too few pixels of the object fit its surface; look at masks and poses in the dataset's report."
         )
     turning = turning_elements(elements, poses[:, :3, :3], SMOOTHING_M, LIFT_M)
-    light = light_on_object(elements, turning, views, white_normal)
-    return RunLight(run, light, shading_evidence(turning, views, light.spectral), renders, mesh)
+    light = light_on_object(elements, turning, views, white_normal, known)
+    covariance, evidence = light.fit.covariance, shading_evidence(turning, views, light.spectral)
+    stationary = KnownLight(light.spectral.light, covariance, centre_m, run.model.wavelengths_nm)
+    return RunLight(run, light, stationary, evidence, renders, mesh)
 
 
 def seen_part(mesh: SurfaceMesh, renders: DepthRenders) -> SurfaceMesh:

@@ -15,8 +15,10 @@ from hsi_sc_nerf.evaluation.spatial import sample_surface
 from hsi_sc_nerf.export.cloud import SpectralCloud, read_spectral_ply, stream
 from hsi_sc_nerf.export.cloud_material import require_bands_of_run, with_material
 from hsi_sc_nerf.export.formats import write_cloud
+from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.geometry.camera import pixel_rays
 from hsi_sc_nerf.light.fit import fit_light
+from hsi_sc_nerf.light.known_light import read_light
 from hsi_sc_nerf.light.of_run import light_of_run, shading_evidence
 from hsi_sc_nerf.models.trained_run import open_trained_run
 from hsi_sc_nerf.packed.cube import pack, write_packed_cube
@@ -123,6 +125,19 @@ def test_files_hold_reflectance_as_measured_and_of_the_material(lit, tmp_path, f
     np.testing.assert_allclose(material * by_band, measured, rtol=1e-4)
     np.testing.assert_allclose(columns["irradiance"], by_band.mean(axis=1), rtol=1e-4)
     np.testing.assert_allclose(columns["irradiance_std"], std, rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_the_light_of_a_file_is_taken_for_what_it_was(lit, tmp_path):
+    cloud = upper_cloud(lit, lit=True)
+    told = light_summary(lit, with_material(cloud, lit, factory.WAVELENGTHS_NM, corrected=True), corrected=True)
+    write_json(tmp_path / "cloud-material.json", told)
+    # The white reference's direction is that of the file's session.
+    taken = light_of_run(lit.run, -FACING, read_light(tmp_path / "cloud-material.json"))
+    points = cloud.points.astype(float)
+    np.testing.assert_allclose(taken.irradiance(points)[0], lit.irradiance(points)[0], rtol=0.01)
+    np.testing.assert_allclose(taken.irradiance(points)[1], lit.irradiance(points)[1], rtol=0.1)
+    assert taken.evidence.shaded
 
 
 @pytest.mark.slow
