@@ -24,6 +24,11 @@ UNCERTAIN = 0.05
 """Irradiance that is more uncertain than this, relative to it, is warned of."""
 
 
+OTHER_LIGHT = 0.1
+"""A taken light is warned of if brightness changes from view to view by more or less than this, relative to what the
+light says. A lamp of another place or strength gives 0.12 and more, the right one 0.01 (docs/validation/light.md)."""
+
+
 @dataclass(frozen=True)
 class MaterialCommand:
     """Tell the material's reflectance apart from the light on the object, in a cloud of a trained run.
@@ -82,7 +87,7 @@ class MaterialCommand:
         found = light_of_run(run, self._white_normal(), known)
         corrected = self.correct == "always" or (self.correct == "auto" and found.evidence.shaded)
         result = with_material(cloud, found, run.model.wavelengths_nm, corrected=corrected)
-        told = light_summary(found, result, corrected=corrected)
+        told = light_summary(found, result, corrected=corrected, light_from=self.light)
         write_cloud(stem, stream(result), file_format)
         write_json(output.with_suffix(".json"), told)
         console = Console(soft_wrap=True, highlight=False)
@@ -104,6 +109,11 @@ def sentences(told: dict[str, Any]) -> list[str]:
         f"(like spectra are as bright as the light says by the factor {evidence['profile']:.2f} ± "
         f"{evidence['profile_std']:.2f}; 1 is right, 0 is even light)."
     ]
+    if told.get("light_from") is not None and abs(evidence["turning"] - 1.0) > OTHER_LIGHT:
+        lines.append(
+            f"Warning: brightness changes from view to view by {evidence['turning']:.2f} times what the light of "
+            f"{told['light_from']} says; has a lamp or the camera been moved? Leave out --light, or capture it anew."
+        )
     if told["corrected"] and (std is None or std > UNCERTAIN):
         by = "an unknown amount" if std is None else f"{100.0 * std:.0f} % (irradiance_std)"
         lines.append(
@@ -113,14 +123,21 @@ def sentences(told: dict[str, Any]) -> list[str]:
     return lines
 
 
-def light_summary(found: RunLight, cloud: SpectralCloud, *, corrected: bool) -> dict[str, Any]:
-    """The light, what tells of it, and its median uncertainty in a cloud `with_material`, ready for JSON."""
+def light_summary(
+    found: RunLight, cloud: SpectralCloud, *, corrected: bool, light_from: Path | None = None
+) -> dict[str, Any]:
+    """The light, what tells of it, and its median uncertainty in a cloud `with_material`, ready for JSON.
+
+    Args:
+        light_from: file that the light was taken from.
+    """
     irradiance, std = (cloud.extra[name] for name in LIGHT_COLUMNS)
     return {
         "corrected": corrected,
         "shaded": found.evidence.shaded,
         "evidence": asdict(found.evidence),
         "relative_std": float(np.median(std / irradiance)) if np.isfinite(std).all() else None,
+        "light_from": None if light_from is None else str(light_from),
         "scatter": found.light.fit.scatter,
         "light": found.stationary.values(),
     }

@@ -157,6 +157,15 @@ def test_light_that_is_too_uncertain_is_warned_of(std, corrected, warned):
     assert any(line.startswith("Warning") for line in sentences(told)) == warned
 
 
+@pytest.mark.parametrize(
+    ("turning", "light_from", "warned"), [(1.02, "b.json", 0), (0.8, "b.json", 1), (0.8, None, 0)]
+)
+def test_the_light_of_another_chamber_is_warned_of(turning, light_from, warned):
+    evidence = {"profile": 0.7, "profile_std": 0.1, "turning": turning}
+    told = {"evidence": evidence, "shaded": True, "corrected": True, "relative_std": 0.02, "light_from": light_from}
+    assert sum("b.json" in line for line in sentences(told)) == warned
+
+
 @pytest.mark.slow
 def test_even_light_is_left_alone(even):
     assert not even.evidence.shaded
