@@ -52,6 +52,7 @@ def kinds(folder: Path) -> list[Kind]:
     from hsi_sc_nerf.evaluation.comparison import read_surface
     from hsi_sc_nerf.export.cloud import read_spectral_ply
     from hsi_sc_nerf.export.sample_points import read_points
+    from hsi_sc_nerf.light.known_light import read_light
     from hsi_sc_nerf.models.checkpoints import read_checkpoint
     from hsi_sc_nerf.models.run_settings import read_config
     from hsi_sc_nerf.packed.dataset import open_packed
@@ -112,6 +113,10 @@ def kinds(folder: Path) -> list[Kind]:
         for step in session_steps(session, folder, SessionSettings()):
             is_up_to_date(step, folder)
 
+    def taken(light: Path) -> None:
+        known = read_light(light)
+        known.at(known.centre_m + 0.01, known.wavelengths_nm)
+
     def applied(table: Path) -> Callable[[], object]:
         return lambda: read_calibration(table).of(np.full((2, 31), 0.5), np.linspace(400.0, 1000.0, 31), True)
 
@@ -168,6 +173,7 @@ def kinds(folder: Path) -> list[Kind]:
         *(Kind(f"batch: {at}", pear / at, every_object, 0.5) for at in _OF_AN_OBJECT),
         Kind("calibration (CSV)", files["calibration"], applied(files["calibration"]), 1.5),
         Kind("calibration (ONNX)", files["onnx"], applied(files["onnx"].with_name("model.csv")), 0.5),
+        Kind("light (JSON)", files["light"], lambda: taken(files["light"]), 1.0),
         Kind("drawn regions (JSON)", files["regions"], lambda: read_drawn_regions(files["regions"]), 1.0),
         Kind("truth's pixels (NPZ)", pixels, every_truth),
         Kind("truth's pixels (array in NPZ)", files["npy"], every_truth_of_array),

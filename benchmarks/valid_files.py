@@ -25,6 +25,8 @@ from hsi_sc_nerf.export.cloud import SpectralCloud, stream, write_spectral_ply
 from hsi_sc_nerf.export.formats import write_cloud
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.geometry.camera import look_at
+from hsi_sc_nerf.light.known_light import KnownLight
+from hsi_sc_nerf.light.stationary_light import TERMS, StationaryLight
 from hsi_sc_nerf.models.checkpoints import CHECKPOINT_KEYS, write_checkpoint
 from hsi_sc_nerf.packed.cube import ReflectanceUncertainty
 from hsi_sc_nerf.packed.dataset import Container, PackedDataset, PackedFrame, write_transforms
@@ -108,6 +110,7 @@ def write_valid_files(folder: Path) -> dict[str, Path]:
         "npy": "pixels.npy",
         "spectrum": "spectrum.csv",
         "steps": STEPS_NAME,
+        "light": "cloud-material.json",
     }
     files |= {name: folder / file for name, file in others.items()}
     files |= {kind: write_cloud(folder / "cloud", stream(cloud), kind) for kind in ("netcdf", "zarr")}
@@ -159,6 +162,9 @@ def write_valid_files(folder: Path) -> dict[str, Path]:
     )
     entry = {"command": "hsi-sc-nerf process", "fingerprint": "0", "finished": True, "seconds": 3.5}
     write_json(files["steps"], {name: entry | {"peak_memory_mib": 800.0} for name in STEPS})
+    lamp = StationaryLight(np.eye(TERMS)[0], np.array([0.5]), np.array([[0.0, 0.6, 0.8]]), 1.6, *np.ones((2, 2)))
+    known = KnownLight(lamp, np.eye(TERMS + 4), np.array([0.0, 0.0, -0.4]), np.array([500.0, 700.0]))
+    write_json(files["light"], {"light": known.values()})
     with SummaryWriter(str(folder / "curves")) as writer:
         for step in range(20):
             writer.add_scalar("Train Loss", 1.0 / (1 + step), step)
