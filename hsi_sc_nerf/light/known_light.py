@@ -119,5 +119,7 @@ def read_light(path: Path) -> KnownLight:
             array("chamber_colour", bands),
             array("lamp_colour", bands),
         )
+        if (light.lamps <= 0.0).any() or not np.allclose(np.linalg.norm(light.to_lamps, axis=1), 1.0, atol=1e-3):
+            raise ValueError("its lamps have no strength or no direction")
         covariance, centre_m = array("covariance", parameters, parameters), array("centre_m", 3)
         return KnownLight(light, covariance, centre_m, array("wavelengths_nm", bands))

@@ -92,6 +92,8 @@ def test_a_file_keeps_all_of_it(tmp_path, light):
         {"lamps": [0.5, 0.2]},
         {"centre_m": [0.0, float("nan"), 0.0]},
         {"to_lamps": "up"},
+        {"to_lamps": [[0.0, 0.0, 0.0]]},
+        {"lamps": [0.0]},
         {"lamps_distance_m": 0.0},
         {"wavelengths_nm": []},
     ],
