@@ -60,7 +60,7 @@ class KnownLight:
             raise InputError("a lamp of the known light would stand inside the object; take a light of this chamber.")
         lamps = light.lamps / distance**2
         # All lamps share one distance.
-        nearness = light.nearness / np.average(distance, weights=lamps) if light.nearness else 0.0
+        nearness = light.nearness / np.average(distance, weights=light.lamps) if light.nearness else 0.0
         moved = replace(
             light,
             lamps=lamps,
