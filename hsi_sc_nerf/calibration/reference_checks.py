@@ -221,4 +221,5 @@ def bright_pixels(light: Float[np.ndarray, "rows samples bands"]) -> Float[np.nd
     """Spectra of the brighter pixels, evenly chosen."""
     brightness = light.mean(axis=-1)
     bright = light[brightness > BRIGHT * np.percentile(brightness, 99.0)]
-    return bright[:: max(1, len(bright) // PIXELS)]
+    # A view would keep all of them in memory.
+    return bright[:: max(1, len(bright) // PIXELS)].copy()

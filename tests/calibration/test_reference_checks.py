@@ -213,3 +213,10 @@ def test_a_real_cube_has_no_lines_where_its_white_is_dark(tmp_path):
         write_cube(tmp_path / f"{name}.hdr", counts, wavelengths_nm=kernel.wavelengths_nm)
         write_cube(tmp_path / f"DARKREF_{name}.hdr", dark.read(), wavelengths_nm=kernel.wavelengths_nm)
     assert line_findings(open_session(tmp_path))[0].level == "green"
+
+
+def test_few_bright_pixels_keep_no_others_in_memory():
+    light = np.random.default_rng(0).uniform(0.5, 1.0, (16, 512, 8)).astype(np.float32)
+    kept = bright_pixels(light)
+    assert 200 < len(kept) < 600
+    assert kept.base is None
