@@ -30,11 +30,11 @@ COMPARED_PX = 40
 FEWEST_COMPARED = 8
 """Fewest frames with which a different one can be recognised."""
 ACCURACY_BY_VIEWS = {
-    8: (3.4, 74, 1.5, 7),
-    12: (2.6, 93, 0.2, 12),
-    20: (2.1, 94, 0.3, 6),
-    30: (1.6, 94, 1.0, 7),
-    60: (1.3, 94, 1.3, 10),
+    8: (3.4, 80, 0.7, 6),
+    12: (2.7, 95, 0.4, 6),
+    20: (2.0, 96, 0.2, 8),
+    30: (1.6, 96, 0.4, 10),
+    60: (1.4, 96, 0.6, 6),
 }
 """Percent by number of views: root mean square error of the reflectance, F-score at 0.5 mm, error of the volume and
 of the area of a bruise (docs/validation/accuracy_and_time.md)."""
