@@ -97,6 +97,9 @@ def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"], known: K
         >>> found = light_of_run(open_trained_run(Path("config.yml")), np.array([0.0, 0.0, 1.0]))
         >>> irradiance, std = found.irradiance(cloud.points)
     """
+    wavelengths_nm = run.model.wavelengths_nm
+    if known is not None:
+        known = known.at(known.centre_m, wavelengths_nm)  # refused before the work
     sampler, dataset = run.manager.train_pixel_sampler, run.dataset
     cameras, batch = run.manager.train_dataset.cameras, run.model.config.eval_num_rays_per_chunk
     renders = render_depth_maps(run.model, cameras, sampler.masks, batch)
@@ -114,7 +117,7 @@ def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"], known: K
     poses[:, :3, 3] = run.to_metres(poses[:, :3, 3])
     centre_m = centre_in_camera(elements, poses)
     if known is not None:
-        known = known.at(centre_m, run.model.wavelengths_nm)
+        known = known.at(centre_m, wavelengths_nm)
 
     def pixels(frame: int, lines: np.ndarray, samples: np.ndarray) -> np.ndarray:
         reflectance, valid = unpack(
@@ -130,7 +133,7 @@ def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"], known: K
     turning = turning_elements(elements, poses[:, :3, :3], SMOOTHING_M, LIFT_M)
     light = light_on_object(elements, turning, views, white_normal, known)
     covariance, evidence = light.fit.covariance, shading_evidence(turning, views, light.spectral)
-    stationary = KnownLight(light.spectral.light, covariance, centre_m, run.model.wavelengths_nm)
+    stationary = KnownLight(light.spectral.light, covariance, centre_m, wavelengths_nm)
     return RunLight(run, light, stationary, evidence, renders, mesh)
 
 
