@@ -18,6 +18,7 @@ from hsi_sc_nerf.settings_file import between, check_options
 
 if TYPE_CHECKING:
     from hsi_sc_nerf.export.cloud import SpectralCloud
+    from hsi_sc_nerf.light.known_light import KnownLight
     from hsi_sc_nerf.light.of_run import RunLight
 
 UNCERTAIN = 0.05
@@ -65,13 +66,12 @@ class MaterialCommand:
         Raises:
             InputError: cloud and run do not fit together or cannot be used, or the result cannot be written.
         """
-        check_options(self)
+        known = self.checked_light()
         require_dataset_of_run(self.load_config)
         from hsi_sc_nerf.export.cloud import band_property_names, read_spectral_ply, stream
         from hsi_sc_nerf.export.cloud_material import require_bands_of_run, with_material
         from hsi_sc_nerf.export.formats import format_of, require_format, write_cloud
         from hsi_sc_nerf.files import require_writable, write_json
-        from hsi_sc_nerf.light.known_light import read_light
         from hsi_sc_nerf.light.of_run import light_of_run
         from hsi_sc_nerf.models.trained_run import open_trained_run
 
@@ -81,7 +81,6 @@ class MaterialCommand:
         cloud = read_spectral_ply(self.cloud)
         extra = {*cloud.extra, *LIGHT_COLUMNS, *band_property_names(cloud.wavelengths_nm, "material")}
         require_format(stem, file_format, len(cloud.wavelengths_nm), len(extra))
-        known = None if self.light is None else read_light(self.light)
         run = open_trained_run(self.load_config)
         require_bands_of_run(cloud, run.model.wavelengths_nm, str(self.cloud))
         found = light_of_run(run, self._white_normal(), known)
@@ -94,6 +93,17 @@ class MaterialCommand:
         for line in sentences(told):
             console.print(line, style="yellow" if line.startswith("Warning") else None)
         console.print(f"{escape(str(output))}: {len(cloud):,} points.")
+
+    def checked_light(self) -> KnownLight | None:
+        """The light that is taken, if any, after a check of the numbers.
+
+        Raises:
+            InputError: a number lies outside its range, or the light cannot be read.
+        """
+        from hsi_sc_nerf.light.known_light import read_light
+
+        check_options(self)
+        return None if self.light is None else read_light(self.light)
 
     def _white_normal(self) -> Float[np.ndarray, "3"]:
         azimuth, elevation = np.deg2rad([self.white_azimuth_deg, self.white_elevation_deg])

@@ -31,7 +31,7 @@ def check_words(settings: SessionSettings) -> None:
     traits = _read("traits", settings.traits, TraitsCommand, "cloud", "--output-dir", "out")
     for name, check in (
         ("process", partial(check_options, process.config)),
-        ("material", partial(check_options, material)),
+        ("material", material.checked_light),
         ("traits", traits.check),
     ):
         try:

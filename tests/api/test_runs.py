@@ -91,6 +91,8 @@ def test_a_cloud_gets_the_material_as_measured_where_the_light_is_even(run):
     np.testing.assert_array_equal(found.extra["irradiance"], 1.0)
     with pytest.raises(InputError, match="bands are not those of the run"):
         run.with_material(random_cloud())
+    with pytest.raises(InputError, match=r"none\.json: cannot be read"):
+        run.with_material(cloud, light="none.json")
 
 
 def test_a_folder_without_a_run_is_one_sentence(tmp_path):

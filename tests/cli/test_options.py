@@ -71,6 +71,7 @@ def test_nonsense_is_one_sentence(config, told):
         (SessionSettings(traits="--roi-file none.json"), r"--traits: none\.json"),
         (SessionSettings(traits="--roi a 0 0 0 1 --roi a 0 0 1 1"), "--traits: --roi gives two regions the name a"),
         (SessionSettings(material="--white-azimuth-deg nan"), "--material: --white-azimuth-deg is nan"),
+        (SessionSettings(material="--light none.json"), r"--material: none\.json: cannot be read"),
     ],
 )
 def test_words_for_a_step_are_refused_before_the_first(settings, told):
