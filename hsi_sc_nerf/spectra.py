@@ -23,6 +23,8 @@ NEAR_NM = 10.0
 """A band represents a wavelength if it is this near, or nearer than half the spacing of the bands."""
 FAR_NM = 30.0
 """Largest distance at which a band represents a wavelength."""
+SAME_BAND_NM = 0.01
+"""Bands of two files whose wavelengths differ by no more are the same."""
 
 
 def covered(wavelengths_nm: Float[np.ndarray, "bands"], targets_nm: Sequence[float]) -> Bool[np.ndarray, "targets"]:
@@ -60,6 +62,14 @@ def require_bands(
 def nearest_bands(wavelengths_nm: Float[np.ndarray, "bands"], targets_nm: ArrayLike) -> Int[np.ndarray, "targets"]:
     """Index of the band whose centre is nearest to each target."""
     return np.abs(wavelengths_nm[None, :] - np.asarray(targets_nm, float)[:, None]).argmin(axis=1)
+
+
+def same_bands(
+    wavelengths_nm: Float[np.ndarray, "bands"], targets_nm: Float[np.ndarray, "targets"]
+) -> Int[np.ndarray, "targets"] | None:
+    """Index of the band at each target wavelength; None if a target lies more than `SAME_BAND_NM` from all bands."""
+    bands = nearest_bands(wavelengths_nm, targets_nm)
+    return bands if np.abs(wavelengths_nm[bands] - targets_nm).max() <= SAME_BAND_NM else None
 
 
 def bands_within(

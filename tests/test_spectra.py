@@ -5,7 +5,7 @@ import torch
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.indices.catalogue import CATALOGUE
 from hsi_sc_nerf.indices.formula import index_values
-from hsi_sc_nerf.spectra import COMPOSITES, composite, covered, require_bands
+from hsi_sc_nerf.spectra import COMPOSITES, composite, covered, require_bands, same_bands
 
 WAVELENGTHS_NM = np.linspace(397.32, 1003.58, 204)
 
@@ -72,3 +72,8 @@ def test_a_gap_is_no_band_but_coarse_bands_are():
 def test_a_band_stands_for_one_wavelength_near_it(centres_nm, index, missing):
     with pytest.raises(InputError, match=f"{index} needs a band near {missing}"):
         index_values(CATALOGUE[index], np.ones((1, 3)), np.array(centres_nm))
+
+
+def test_the_same_bands_are_found_and_near_ones_are_not_the_same():
+    np.testing.assert_array_equal(same_bands(WAVELENGTHS_NM, WAVELENGTHS_NM[[7, 3]] + 0.004), [7, 3])
+    assert same_bands(WAVELENGTHS_NM, WAVELENGTHS_NM[[7, 3]] + np.array([0.0, 0.5])) is None

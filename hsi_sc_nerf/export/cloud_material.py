@@ -24,6 +24,7 @@ from hsi_sc_nerf.export.cloud import (
 )
 from hsi_sc_nerf.light.fit import WHITE_STD
 from hsi_sc_nerf.light.of_run import RunLight
+from hsi_sc_nerf.spectra import SAME_BAND_NM, same_bands
 
 NEIGHBOURS = 4
 """Points of the cloud whose mean a point gets."""
@@ -105,8 +106,8 @@ def require_bands_of_run(
     Raises:
         InputError: the run has no such band.
     """
-    bands = np.abs(cloud.wavelengths_nm[:, None] - run_nm).argmin(axis=1)
-    if np.abs(run_nm[bands] - cloud.wavelengths_nm).max() > 0.01:
+    bands = same_bands(run_nm, cloud.wavelengths_nm)
+    if bands is None:
         raise InputError(f"{what}: its bands are not those of the run; give the run that it was exported from.")
     return bands
 
@@ -123,7 +124,7 @@ def read_material(path: Path, wavelengths_nm: Float[np.ndarray, "bands"]) -> Clo
     """
     cloud = read_spectral_ply(path)
     same = len(cloud.wavelengths_nm) == len(wavelengths_nm)
-    if not same or not np.allclose(cloud.wavelengths_nm, wavelengths_nm, atol=0.01):
+    if not same or not np.allclose(cloud.wavelengths_nm, wavelengths_nm, atol=SAME_BAND_NM):
         raise InputError(f"{path}: its bands are not those of the run; take the cloud of the same run.")
     spectra = material_spectra(cloud)
     if spectra is None or not set(LIGHT_COLUMNS) <= set(cloud.extra):

@@ -16,9 +16,7 @@ from jaxtyping import Float
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import content_of, read_json
 from hsi_sc_nerf.light.stationary_light import TERMS, StationaryLight
-
-SAME_BAND_NM = 0.01
-"""Bands of two sessions whose wavelengths differ by less are the same."""
+from hsi_sc_nerf.spectra import same_bands
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +45,8 @@ class KnownLight:
         Raises:
             InputError: one of the bands is not among the light's.
         """
-        bands = np.abs(wavelengths_nm[:, None] - self.wavelengths_nm).argmin(axis=1)
-        if np.abs(self.wavelengths_nm[bands] - wavelengths_nm).max() > SAME_BAND_NM:
+        bands = same_bands(self.wavelengths_nm, wavelengths_nm)
+        if bands is None:
             raise InputError(
                 "the known light has other bands than the run; take one of a session with the same bands."
             )
