@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.geometry.camera import unit_vectors
-from hsi_sc_nerf.light.materials import LightFit, MaterialFitting
+from hsi_sc_nerf.light.material_fit import LightFit, MaterialFitting
 from hsi_sc_nerf.light.shared_errors import CORRELATED, SharedErrors
 from hsi_sc_nerf.light.stationary_light import (
     DEGREE_OF_TERM,

@@ -101,11 +101,13 @@ def read_light(path: Path) -> KnownLight:
         distance_m = values["lamps_distance_m"]
         nearness = 0.0 if distance_m is None else 1.0 / float(distance_m)
         lamps, bands = len(values["lamps"]), len(values["wavelengths_nm"])
+        if not bands:
+            raise ValueError("it has no bands")
         parameters = TERMS + 3 * lamps + (lamps > 0)
 
         def array(name: str, *shape: int) -> np.ndarray:
             found = np.array(values[name], float).reshape(shape)
-            if not np.isfinite(found).all() or (not found.size and lamps):
+            if not np.isfinite(found).all():
                 raise ValueError(f"{name} is damaged")
             return found
 

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from hsi_sc_nerf.light.elements import NORMAL_WEIGHT, Elements, shown_points
 from hsi_sc_nerf.light.fit import fit_light
 from hsi_sc_nerf.light.known_light import KnownLight
-from hsi_sc_nerf.light.materials import LEAST_IRRADIANCE, OCCLUSION_ERROR, LightFit, materials_under
+from hsi_sc_nerf.light.material_fit import LEAST_IRRADIANCE, OCCLUSION_ERROR, LightFit, materials_under
 from hsi_sc_nerf.light.stationary_light import even_directions
 from hsi_sc_nerf.light.views import ElementViews, TurningElements, transfer
 

@@ -19,7 +19,7 @@ from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.light.elements import observe_elements, spread_elements, support_mesh
 from hsi_sc_nerf.light.known_light import KnownLight
 from hsi_sc_nerf.light.material import ObjectLight, centre_in_camera, light_on_object, turning_elements
-from hsi_sc_nerf.light.materials import LightFit
+from hsi_sc_nerf.light.material_fit import LightFit
 from hsi_sc_nerf.light.views import ElementViews, TurningElements
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.packed.cube import unpack

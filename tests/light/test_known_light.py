@@ -9,7 +9,7 @@ from light_on_a_ball import FACING, TO_LAMP, measured, turning_ball, upright_pos
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.light.fit import fit_light
 from hsi_sc_nerf.light.known_light import KnownLight, read_light
-from hsi_sc_nerf.light.materials import materials_under
+from hsi_sc_nerf.light.material_fit import materials_under
 from hsi_sc_nerf.light.stationary_light import TERMS, StationaryLight, even_chamber
 
 BANDS_NM = np.array([500.0, 700.0])
@@ -96,6 +96,7 @@ def test_a_file_keeps_all_of_it(tmp_path, light):
         {"lamps": [0.0]},
         {"lamps_distance_m": 0.0},
         {"wavelengths_nm": []},
+        {"wavelengths_nm": [], "chamber_colour": [], "lamp_colour": []},
     ],
 )
 def test_a_damaged_file_is_refused_by_name(tmp_path, damage):
