@@ -2,6 +2,8 @@
 
     uv run python benchmarks/accuracy_and_time.py --output-dir /tmp/front
     uv run python benchmarks/accuracy_and_time.py --output-dir /tmp/front --parts views --scene maize
+    uv run python benchmarks/accuracy_and_time.py --output-dir /tmp/front --parts presets \
+        --size 256 --bands 25 --binning 8
 
 A simulated noisy session is trained for the same time with every setting, and judged against what is known:
 held-out views without the noise, the true surface, its area and volume. A row is the mean over the seeds and their
@@ -131,7 +133,7 @@ class AccuracyAndTime(PaperTable):
     """Whether a pear or apple has a bruise."""
     motion: tyro.conf.Suppress[str] = ""
     """Effect of the turntable as YAML, with which views are not evenly spaced over a turn."""
-    binning: tyro.conf.Suppress[int] = 1
+    binning: int = 1
     """Bands of the sensor that make one of the session: their electrons, and their noise."""
     picture: Path | None = None
     """PNG file to draw the table to."""
@@ -147,15 +149,22 @@ class AccuracyAndTime(PaperTable):
                     judged = command.judged(name, words, seed)
                     cost = seconds.get(name, seconds[DEFAULT])
                     found[name].append(judged | {"seconds": judged["steps"] * cost})
-            title = part if self.scene == "pear" else f"{part}, {self.scene}"
             write_results(
-                *("accuracy_and_time", TITLES, table_rows(title, found)),
+                *("accuracy_and_time", TITLES, table_rows(self._title(part), found)),
                 keys=2,
                 seed=f"scene, runs {' '.join(map(str, self.seeds))}",
                 folder=self.results,
             )
         if self.picture is not None:
             draw_front(self.picture, read_results(self.results / "accuracy_and_time.csv")[1:])
+
+    def _title(self, part: Part) -> str:
+        """Name of the part in the table: with the object and the pictures where they are not the usual ones."""
+        usual = AccuracyAndTime(output_dir=self.output_dir)
+        words = [self.scene] if self.scene != usual.scene else []
+        if (self.size, self.bands) != (usual.size, usual.bands):
+            words.append(f"{self.size} px, {self.bands} bands")
+        return ", ".join((part, *words))
 
     def _step_seconds(self, part: Part) -> dict[str, float]:
         """Seconds of a step of the default and of the part's rows that have another, by name."""

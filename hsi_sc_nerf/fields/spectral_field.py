@@ -28,9 +28,9 @@ from torch import Tensor, nn
 from hsi_sc_nerf.fields.camera_shading import CameraShading
 from hsi_sc_nerf.fields.hash_grid import FusedHashEncoding, fuse_hash_encodings
 
-BRIGHTNESS_GAIN = 0.05
-"""Gain of the first coefficient of a spectral basis. Without it, brightness is learned faster than the density and
-explains the views before a surface forms (docs/notes/dead_ends.md)."""
+BRIGHTNESS_GAIN = 0.5
+"""Gain of the first coefficient of a spectral basis. Without it, brightness is learned faster than the density, and
+the surface is worse; with a tenth of it, errors fall later and hollows stay closed (docs/notes/dead_ends.md)."""
 
 START_DENSITIES = (40.0, 0.5)
 """Densities (per scene unit) that training begins with inside of what is taken to be solid, and outside."""
@@ -229,7 +229,7 @@ class SpectralProposalField(HashMLPDensityField):
 
 
 class CoefficientGain(nn.Module):
-    """Output layer of a basis head: the first coefficient, a spectrum's brightness, is learned slowly.
+    """Output layer of a basis head: the first coefficient, a spectrum's brightness, is learned more slowly.
 
     Args:
         rank: number of coefficients.
@@ -241,7 +241,7 @@ class CoefficientGain(nn.Module):
         super().__init__()
         gains = torch.ones(rank)
         gains[0] = BRIGHTNESS_GAIN
-        self.register_buffer("gains", gains, persistent=False)
+        self.register_buffer("gains", gains)  # kept with the weights, which mean nothing with other gains
 
     def forward(self, raw: Float[Tensor, "*samples rank"]) -> Float[Tensor, "*samples rank"]:
         """Coefficients from the outputs of the network."""
