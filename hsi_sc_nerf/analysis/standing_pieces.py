@@ -17,6 +17,11 @@ LEAST_FRACTION = 0.05
 STANDING_M = 0.005
 """Largest height of a piece's lowest point above the base: the last millimetres are rarely seen. What begins higher,
 as a stem that training left apart from its fruit, belongs to the nearest piece."""
+NEIGHBOURS, BRIDGED_SPACINGS = 6, 1.5
+"""Points within so many times the usual distance to so many neighbours are linked: random points on a closed surface
+then hang together, however few they are."""
+SPACING_POINTS = 10_000
+"""Points whose neighbours are looked up."""
 
 
 def one_piece(cloud: SpectralCloud, piece: int | None, config: MeshConfig) -> SpectralCloud:
@@ -25,7 +30,8 @@ def one_piece(cloud: SpectralCloud, piece: int | None, config: MeshConfig) -> Sp
     Args:
         cloud: metres, z up.
         piece: its number; 1 for that of the largest surface. None where there is but one.
-        config: how the cloud is meshed; parts are apart if the smoothing does not bridge what is between them.
+        config: how the cloud is meshed; parts are apart if neither the smoothing nor the usual distance between
+            points bridges what is between them.
 
     Raises:
         InputError: no such piece, or several and none is chosen.
@@ -53,7 +59,8 @@ def standing_pieces(points_m: Float[np.ndarray, "n 3"], config: MeshConfig) -> l
     # A point for each cell, so that numbers stand for areas; cells that touch at a corner are no gap.
     cell_m = config.smoothing_radius_m
     cells, _ = thinned(points_m, points_m, cell_m)
-    pairs = cKDTree(cells).query_pairs(2.0 * cell_m, output_type="ndarray")
+    reach_m = max(2.0 * cell_m, BRIDGED_SPACINGS * _spacing_m(points_m))
+    pairs = cKDTree(cells).query_pairs(reach_m, output_type="ndarray")
     linked = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(cells), len(cells)))
     _, part = connected_components(linked, directed=False)
     lowest_m = np.full(part.max() + 1, np.inf)
@@ -67,3 +74,10 @@ def standing_pieces(points_m: Float[np.ndarray, "n 3"], config: MeshConfig) -> l
     of_piece = np.isin(part, order)
     nearest = cKDTree(cells[of_piece]).query(points_m, workers=-1)[1]
     return [np.flatnonzero(part[of_piece][nearest] == one) for one in order]
+
+
+def _spacing_m(points_m: Float[np.ndarray, "n 3"]) -> float:
+    """Median distance to the `NEIGHBOURS`-th neighbour; to the last one where there are fewer."""
+    neighbours = min(NEIGHBOURS + 1, len(points_m))  # the nearest is the point itself
+    some = points_m[:: max(1, len(points_m) // SPACING_POINTS)]
+    return float(np.median(cKDTree(points_m).query(some, k=[neighbours], workers=-1)[0]))

@@ -8,11 +8,11 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
+from matplotlib import rc_context
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.findings import Finding, Level, names_in_short
-from hsi_sc_nerf.plotting import save_figure
+from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure
 from hsi_sc_nerf.poses.result import TurntablePoses, is_full_turn
 
 # The paper's target for the reprojection error (section "Pose Estimation").
@@ -261,14 +261,14 @@ def describe_poses(poses: TurntablePoses, report: dict) -> list[str]:
     return parts
 
 
+@rc_context(STYLE)
 def draw_poses(poses: TurntablePoses, report: dict, path: Path) -> None:
     """Draw cameras and markers from above, and errors and steps by frame, into a picture file.
 
     Raises:
         InputError: the operating system refused to write.
     """
-    figure = Figure(figsize=(13, 6), dpi=110)
-    figure.subplots_adjust(left=0.06, right=0.98, bottom=0.1, top=0.82, wspace=0.2, hspace=0.35)
+    figure = new_figure(11.0, 5.0)
     words = textwrap.fill(f"By {poses.method}: {', '.join(describe_poses(poses, report))}", _TITLE_CHARACTERS)
     figure.suptitle(f"{words}\n{len(report['warnings'])} warnings (see poses.json)", fontsize=9)
     eyes = poses.camera_to_world[poses.used, :3, 3]
@@ -278,7 +278,7 @@ def draw_poses(poses: TurntablePoses, report: dict, path: Path) -> None:
     top.scatter(eyes[:, 0], eyes[:, 1], c=np.arange(len(eyes)), cmap="viridis", s=12)
     top.quiver(
         eyes[:, 0], eyes[:, 1], arrows[:, 0], arrows[:, 1],
-        angles="xy", scale_units="xy", scale=1, color="tab:red", width=0.003,
+        angles="xy", scale_units="xy", scale=1, color=COLOURS[1], width=0.003,
     )  # fmt: skip
     for corners in poses.marker_corners_m.values():
         top.plot(*np.vstack([corners, corners[:1]])[:, :2].T, color="black", linewidth=0.8)
@@ -288,9 +288,9 @@ def draw_poses(poses: TurntablePoses, report: dict, path: Path) -> None:
 
     error = figure.add_subplot(2, 2, 2)
     index = np.arange(len(poses.names))
-    error.bar(index[poses.used], poses.reprojection_error_px[poses.used], color="tab:blue")
+    error.bar(index[poses.used], poses.reprojection_error_px[poses.used], color=COLOURS[0])
     left_out = index[~poses.used]
-    error.plot(left_out, np.zeros(len(left_out)), "x", color="tab:red", label="left out", clip_on=False)
+    error.plot(left_out, np.zeros(len(left_out)), "x", color=COLOURS[1], label="left out", clip_on=False)
     error.axhline(REPROJECTION_TARGET_PX, color="black", linestyle="--", label="target")
     if np.isfinite(poses.overall_error_px):
         # Far below the target, the frames are compared with each other.
@@ -300,7 +300,7 @@ def draw_poses(poses: TurntablePoses, report: dict, path: Path) -> None:
 
     turn = figure.add_subplot(2, 2, 4, sharex=error)
     used = index[poses.used]
-    turn.plot(used[1:], np.diff(poses.angles_deg[used]), ".", color="tab:blue")
+    turn.plot(used[1:], np.diff(poses.angles_deg[used]), ".", color=COLOURS[0])
     turn.ticklabel_format(axis="y", useOffset=False)
     turn.set(xlabel="frame", ylabel="step since the last (degrees)")
     save_figure(figure, path)

@@ -40,6 +40,18 @@ def test_pieces_that_stand_apart_are_told_apart_by_size():
     assert sum(map(len, found)) == len(points)
 
 
+@pytest.mark.parametrize("count", [200, 1000])
+@pytest.mark.parametrize("seed", range(5))
+def test_gaps_between_the_few_points_of_a_small_cloud_are_no_gaps_between_objects(count, seed):
+    points, _, ball = balls((1.0, [-0.07, 0, 0]), (1.0, [0.07, 0, 0]))
+    few = np.random.default_rng(seed).choice(len(points), 2 * count, replace=False)
+    assert len(standing_pieces(points[few][ball[few] == 0], CONFIG)) == 1
+    assert {frozenset(ball[few][piece]) for piece in standing_pieces(points[few], CONFIG)} == {
+        frozenset({0}),
+        frozenset({1}),
+    }
+
+
 @pytest.mark.parametrize(
     "second",
     [
