@@ -37,7 +37,7 @@ _MOST_NAMES = 8
 _ARROW_FRACTION = 0.15
 _AXIS_OVER_LARGEST = 1.4
 # What fits into a line of the figure's title.
-_TITLE_CHARACTERS = 190
+_TITLE_CHARACTERS = 150
 
 
 def check_poses(poses: TurntablePoses, info: SessionInfo) -> list[Finding]:
@@ -269,12 +269,13 @@ def draw_poses(poses: TurntablePoses, report: dict, path: Path) -> None:
         InputError: the operating system refused to write.
     """
     figure = new_figure(11.0, 5.0)
+    grid = figure.add_gridspec(2, 2)
     words = textwrap.fill(f"By {poses.method}: {', '.join(describe_poses(poses, report))}", _TITLE_CHARACTERS)
     figure.suptitle(f"{words}\n{len(report['warnings'])} warnings (see poses.json)", fontsize=9)
     eyes = poses.camera_to_world[poses.used, :3, 3]
     arrows = -poses.camera_to_world[poses.used, :3, 2] * _ARROW_FRACTION * np.linalg.norm(eyes[0])
 
-    top = figure.add_subplot(1, 2, 1)
+    top = figure.add_subplot(grid[:, 0])
     top.scatter(eyes[:, 0], eyes[:, 1], c=np.arange(len(eyes)), cmap="viridis", s=12)
     top.quiver(
         eyes[:, 0], eyes[:, 1], arrows[:, 0], arrows[:, 1],
@@ -286,7 +287,7 @@ def draw_poses(poses: TurntablePoses, report: dict, path: Path) -> None:
     top.set(xlabel="x (m)", ylabel="y (m)", title="Cameras in the object frame, from above")
     top.set_aspect("equal")
 
-    error = figure.add_subplot(2, 2, 2)
+    error = figure.add_subplot(grid[0, 1])
     index = np.arange(len(poses.names))
     error.bar(index[poses.used], poses.reprojection_error_px[poses.used], color=COLOURS[0])
     left_out = index[~poses.used]
@@ -298,7 +299,7 @@ def draw_poses(poses: TurntablePoses, report: dict, path: Path) -> None:
     error.set(ylabel="reprojection error (px)")
     error.legend(loc="upper right", fontsize=8)
 
-    turn = figure.add_subplot(2, 2, 4, sharex=error)
+    turn = figure.add_subplot(grid[1, 1], sharex=error)
     used = index[poses.used]
     turn.plot(used[1:], np.diff(poses.angles_deg[used]), ".", color=COLOURS[0])
     turn.ticklabel_format(axis="y", useOffset=False)
