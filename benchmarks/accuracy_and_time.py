@@ -3,7 +3,7 @@
     uv run python benchmarks/accuracy_and_time.py --output-dir /tmp/front
     uv run python benchmarks/accuracy_and_time.py --output-dir /tmp/front --parts views --scene maize
     uv run python benchmarks/accuracy_and_time.py --output-dir /tmp/front --parts presets \
-        --size 256 --bands 25 --binning 8
+        --size 256 --bands 25
 
 A simulated noisy session is trained for the same time with every setting, and judged against what is known:
 held-out views without the noise, the true surface, its area and volume. A row is the mean over the seeds and their
@@ -96,10 +96,7 @@ SPACINGS: dict[str, dict[str, Any]] = {
 PICTURES: dict[str, dict[str, int]] = {
     DEFAULT: {},
     **{f"{size} x {size} pixels": {"size": size} for size in (64, 96, 192)},
-    **{
-        f"{paper.BANDS // binning} bands": {"bands": paper.BANDS // binning, "binning": binning}
-        for binning in (2, 4, 8)
-    },
+    **{f"{bands} bands": {"bands": bands} for bands in (102, 51, 25)},
 }
 
 BRUISE_M = 0.02
@@ -133,8 +130,6 @@ class AccuracyAndTime(PaperTable):
     """Whether a pear or apple has a bruise."""
     motion: tyro.conf.Suppress[str] = ""
     """Effect of the turntable as YAML, with which views are not evenly spaced over a turn."""
-    binning: int = 1
-    """Bands of the sensor that make one of the session: their electrons, and their noise."""
     picture: Path | None = None
     """PNG file to draw the table to."""
 
@@ -158,11 +153,15 @@ class AccuracyAndTime(PaperTable):
         if self.picture is not None:
             draw_front(self.picture, read_results(self.results / "accuracy_and_time.csv")[1:])
 
+    @property
+    def binning(self) -> int:
+        """Bands of the sensor that make one of the session: their electrons, and their noise."""
+        return paper.BANDS // self.bands
+
     def _title(self, part: Part) -> str:
         """Name of the part in the table: with the object and the pictures where they are not the usual ones."""
-        usual = AccuracyAndTime(output_dir=self.output_dir)
-        words = [self.scene] if self.scene != usual.scene else []
-        if (self.size, self.bands) != (usual.size, usual.bands):
+        words = [self.scene] if self.scene != AccuracyAndTime.scene else []
+        if (self.size, self.bands) != (AccuracyAndTime.size, AccuracyAndTime.bands):
             words.append(f"{self.size} px, {self.bands} bands")
         return ", ".join((part, *words))
 

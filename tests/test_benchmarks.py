@@ -174,6 +174,14 @@ def test_rows_are_trained_for_the_steps_that_their_time_buys(tmp_path, monkeypat
     ]
 
 
+def test_a_part_is_named_after_what_is_not_usual_in_it():
+    titles = {
+        AccuracyAndTime(output_dir=Path(), **change)._title("presets")
+        for change in ({}, {"scene": "maize"}, {"size": 256, "bands": 25})
+    }
+    assert titles == {"presets", "presets, maize", "presets, 256 px, 25 bands"}
+
+
 STAND_INS = Path(__file__).parents[1] / "benchmarks" / "gpu_stand_ins"
 SCRIPT = """
 import sys
