@@ -1,6 +1,7 @@
 """The paper's recipe and ours on simulated pear, apple and maize, beside the paper's table.
 
-    uv run python benchmarks/beyond_the_paper.py --output-dir /tmp/beyond --clock cpu --threads 1 --configurations paper
+    uv run python benchmarks/beyond_the_paper.py --output-dir /tmp/beyond --clock cpu --threads 1 \
+        --configurations paper
     uv run python benchmarks/beyond_the_paper.py --output-dir /tmp/beyond --threads 1 --iterations 1600 \
         --configurations ours --seeds 0 1 2
 
