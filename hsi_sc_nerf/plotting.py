@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import matplotlib
 import numpy as np
@@ -22,6 +22,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
 from hsi_sc_nerf.files import atomic_write
 
@@ -90,6 +91,14 @@ def show_image(axes: Axes, image: np.ndarray, **options: Any) -> AxesImage:
     if image.ndim == 3 and image.dtype != np.uint8:
         image = np.clip(image, 0, 1)
     return axes.imshow(image, extent=(0, width, height, 0), interpolation="nearest", **options)
+
+
+def logarithmic_axis(axes: Axes, which: Literal["x", "y"]) -> None:
+    """Make an axis logarithmic, with numbers at its ticks; matplotlib's are formulas, which `STYLE` does not set."""
+    axes.set(**{f"{which}scale": "log"})
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def usual_range(values: Float[np.ndarray, "*shape"]) -> tuple[float, float]:

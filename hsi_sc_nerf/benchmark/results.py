@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+from matplotlib.ticker import LogLocator
 from rich.table import Table
 
 from hsi_sc_nerf.benchmark.run import BenchmarkRun
 from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.models.schedule import Clock
-from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure
+from hsi_sc_nerf.plotting import COLOURS, STYLE, logarithmic_axis, new_figure, save_figure
 from hsi_sc_nerf.terminal import markdown_table, screen_table
 
 _COLUMNS = {
@@ -129,10 +129,8 @@ def draw_accuracy_and_time(path: Path, runs: Sequence[BenchmarkRun], clock: Cloc
             axes.plot(*curve, color=colour, linestyle=line, label=run.name, marker="o", markersize=2.5)
             axes.plot(*curve[:, ends], "o", color=colour, markersize=7, fillstyle="none")
         if metric in _LOGARITHMIC:
-            axes.set_yscale("log")
+            logarithmic_axis(axes, "y")
             axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
-            axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-            axes.yaxis.set_minor_formatter(NullFormatter())
         axes.set_title(f"{title}, {'lower' if metric in _LOGARITHMIC else 'higher'} is better")
     for axes in panels[1]:
         axes.set_xlabel(f"training ({'wall' if clock == 'wall' else 'processor'} seconds)")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib import colormaps
+from matplotlib import colormaps, rc_context
 from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
@@ -24,7 +24,7 @@ from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.morphology import draw_outline
 from hsi_sc_nerf.packed.cube import ReflectanceUncertainty
-from hsi_sc_nerf.plotting import new_figure, save_figure
+from hsi_sc_nerf.plotting import COLOURS, STYLE, logarithmic_axis, new_figure, save_figure
 from hsi_sc_nerf.spectra import nearest_bands, to_8_bit
 
 REPORT_NAME = "calibration.json"
@@ -110,6 +110,7 @@ def draw_calibration(
         draw_uncertainty(folder / "uncertainty.png", calibration.uncertainty, wavelengths_nm[calibration.bands])
 
 
+@rc_context(STYLE)
 def draw_white_reference(path: Path, cube: Cube, white: WhiteReference, rgb_nm: Sequence[float]) -> None:
     """Draw the steps to the white reference (the paper's appendix).
 
@@ -126,7 +127,7 @@ def draw_white_reference(path: Path, cube: Cube, white: WhiteReference, rgb_nm: 
     mosaic = figure.subplot_mosaic("iiiddd;lluuhh;ssssss", height_ratios=[4.0, 4.0, 3.0])
     axes = {panel: mosaic[letter] for letter, panel in panels.items()}
     axes["image"].imshow(draw_outline(image, white.region(image.shape[:2])))
-    region = Rectangle((x0 - 0.5, y0 - 0.5), x1 - x0, y1 - y0, fill=False, edgecolor="tab:red", linewidth=2)
+    region = Rectangle((x0 - 0.5, y0 - 0.5), x1 - x0, y1 - y0, fill=False, edgecolor=COLOURS[1], linewidth=2)
     axes["image"].add_patch(region)
     axes["image"].set_title(f"White: coarse region, and the {white.pixels} pixels that are kept")
     extent = (x0 - 0.5, x1 - 0.5, y1 - 0.5, y0 - 0.5)
@@ -141,11 +142,14 @@ def draw_white_reference(path: Path, cube: Cube, white: WhiteReference, rgb_nm: 
         axes[name].imshow(np.where(mask[..., None], inside, inside // 4), extent=extent)
         mean = f"{white.deviation[mask].mean():.4f}" if mask.any() else "-"
         kept_percent = 100.0 * mask.mean()
-        axes[name].set_title(f"{percentile:g}th percentile keeps {kept_percent:.1f} %,\nmean D {mean}", fontsize=10)
+        axes[name].set_title(f"{percentile:g}th percentile keeps {kept_percent:.1f} %,\nmean D {mean}")
+    for name in panels.values():
+        axes[name].grid(name == "spectrum")
     _draw_spectrum(axes["spectrum"], white, cube.wavelengths_nm)
     save_figure(figure, path)
 
 
+@rc_context(STYLE)
 def draw_column_white(path: Path, white: White, wavelengths_nm: Float[np.ndarray, "bands"]) -> None:
     """Draw the white of a capture: its counts by detector column and band, and their mean spectrum."""
     figure = new_figure(11.0, 6.5)
@@ -153,11 +157,13 @@ def draw_column_white(path: Path, white: White, wavelengths_nm: Float[np.ndarray
     edges = (0.5, len(wavelengths_nm) + 0.5, len(white.spectrum) - 0.5, -0.5)
     shown = by_column.imshow(white.spectrum, aspect="auto", interpolation="nearest", extent=edges)
     figure.colorbar(shown, ax=by_column, label="counts above dark")
+    by_column.grid(False)
     by_column.set(xlabel="band", ylabel="sample", title="White by detector column (blank where an element is dead)")
     _draw_spectrum(spectrum, white, wavelengths_nm)
     save_figure(figure, path)
 
 
+@rc_context(STYLE)
 def draw_lamp_drift(
     path: Path, drift: LampDriftEstimate, wavelengths_nm: Float[np.ndarray, "bands"], *, corrected: bool
 ) -> None:
@@ -176,12 +182,10 @@ def draw_lamp_drift(
         f"Light of the lamps: {'corrected' if corrected else 'not corrected'} "
         f"({'significant' if drift.significant else 'not significant'}, p = {max(drift.p_value, SMALLEST_P):.1g})"
     )
-    by_band.plot(
-        wavelengths_nm, 100.0 * (drift.measured[-1] - 1.0), ".", color="tab:gray", markersize=3, label="measured"
-    )
-    by_band.plot(wavelengths_nm, change[-1], color="tab:blue", label="smooth, with 2 standard errors")
+    by_band.plot(wavelengths_nm, 100.0 * (drift.measured[-1] - 1.0), ".", color="0.5", markersize=3, label="measured")
+    by_band.plot(wavelengths_nm, change[-1], color=COLOURS[0], label="smooth, with 2 standard errors")
     low, high = change[-1] - two_sd[-1], change[-1] + two_sd[-1]
-    by_band.fill_between(wavelengths_nm, low, high, color="tab:blue", alpha=0.3, linewidth=0)
+    by_band.fill_between(wavelengths_nm, low, high, color=COLOURS[0], alpha=0.3, linewidth=0)
     by_band.legend()
     by_band.set(xlabel="wavelength (nm)", ylabel="change in the last frame (%)")
     by_band.set_title(f"Measured on {100.0 * drift.static_fraction:.0f} % of the surveyed pixels, which are static")
@@ -190,6 +194,7 @@ def draw_lamp_drift(
     save_figure(figure, path)
 
 
+@rc_context(STYLE)
 def draw_uncertainty(
     path: Path, uncertainty: ReflectanceUncertainty, wavelengths_nm: Float[np.ndarray, "bands"]
 ) -> None:
@@ -203,9 +208,9 @@ def draw_uncertainty(
     brightest = max(REFLECTANCES)
     of_white = np.sqrt(uncertainty.quadratic) * brightest
     axes.plot(wavelengths_nm, of_white, color="0.5", linestyle="--", label=f"the white's part at {brightest:g}")
-    axes.set(xlabel="wavelength (nm)", ylabel="standard deviation of one pixel's reflectance", yscale="log")
+    axes.set(xlabel="wavelength (nm)", ylabel="standard deviation of one pixel's reflectance")
+    logarithmic_axis(axes, "y")
     axes.set_title("Uncertainty of the reflectance")
-    axes.grid(color="0.9")
     axes.legend()
     save_figure(figure, path)
 
@@ -229,9 +234,9 @@ def _drift(session: Session, calibration: SessionCalibration) -> dict[str, Any]:
 def _draw_spectrum(axes: Axes, white: White, wavelengths_nm: Float[np.ndarray, "bands"]) -> None:
     """The mean white spectrum before and after smoothing, with its bad bands marked."""
     for middle in wavelengths_nm[white.bad_bands]:
-        axes.axvline(middle, color="tab:red", alpha=0.25, linewidth=3)
-    axes.plot(wavelengths_nm, mean_over_columns(white.measured), color="tab:gray", label="measured")
-    axes.plot(wavelengths_nm, white.mean_spectrum(), color="tab:blue", linewidth=1, label="smoothed")
+        axes.axvline(middle, color=COLOURS[1], alpha=0.25, linewidth=3)
+    axes.plot(wavelengths_nm, mean_over_columns(white.measured), color="0.5", label="measured")
+    axes.plot(wavelengths_nm, white.mean_spectrum(), color=COLOURS[0], linewidth=1, label="smoothed")
     bad = np.count_nonzero(white.bad_bands)
     axes.set(xlabel="wavelength (nm)", ylabel="counts above dark")
     axes.set_title(f"White spectrum{f', {bad} bad bands marked' if bad else ''}")

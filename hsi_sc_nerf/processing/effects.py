@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
+from matplotlib import rc_context
 from rich.console import Console
 
 from hsi_sc_nerf.calibration.lamp_drift import SIGNIFICANCE, LampDriftEstimate, NotMeasurable
@@ -18,7 +19,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import CERTAIN, EFFECT_COLUMNS, EffectEvidence, effect_rows
 from hsi_sc_nerf.packed.cube import PixelFlag
 from hsi_sc_nerf.packed.dataset import PackedDataset
-from hsi_sc_nerf.plotting import new_figure, save_figure
+from hsi_sc_nerf.plotting import COLOURS, STYLE, logarithmic_axis, new_figure, save_figure
 from hsi_sc_nerf.poses.model_selection import EVIDENCE_NEEDED
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.processing.chamber import background_pixels, gain_of_background_image
@@ -209,6 +210,7 @@ def show_effects(console: Console, effects: Sequence[EffectEvidence]) -> None:
         console.print(f"{effect.name}: {effect.sentence}", highlight=False, markup=False, soft_wrap=True)
 
 
+@rc_context(STYLE)
 def draw_effects(path: Path, effects: Sequence[EffectEvidence]) -> None:
     """Draw the evidence of each effect as a multiple of its threshold.
 
@@ -224,14 +226,15 @@ def draw_effects(path: Path, effects: Sequence[EffectEvidence]) -> None:
     axes = figure.subplots()
     for row, (effect, ratio, error) in enumerate(drawn):
         at = float(np.clip(ratio, 1.0 / LARGEST_DRAWN, LARGEST_DRAWN))
-        colour = "tab:red" if effect.present else "tab:gray"
+        colour = COLOURS[1] if effect.present else "0.5"
         axes.errorbar(at, row, xerr=[[min(error, 0.99 * at)], [error]], fmt="o", capsize=3, color=colour)
         words = f"{effect.evidence:.2g} {effect.unit}, threshold {effect.threshold:.2g}"
         axes.annotate(words, (at, row), xytext=(0, 7), textcoords="offset points", ha="center", fontsize=8)
     axes.axvline(1.0, color="black", linestyle="--", linewidth=1)
-    axes.set(xscale="log", xlim=(0.2 / LARGEST_DRAWN, 5.0 * LARGEST_DRAWN), ylim=(-0.6, len(drawn) - 0.2))
+    logarithmic_axis(axes, "x")
+    axes.set(xlim=(0.2 / LARGEST_DRAWN, 5.0 * LARGEST_DRAWN), ylim=(-0.6, len(drawn) - 0.2))
     axes.set_yticks(range(len(drawn)), [effect.name for effect, _, _ in drawn])
-    axes.set(xlabel="evidence over threshold (bars: 3 standard deviations); red: the effect is there")
+    axes.set(xlabel="evidence over threshold (bars: 3 standard deviations); coloured: the effect is there")
     save_figure(figure, path)
 
 

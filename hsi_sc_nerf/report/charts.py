@@ -18,9 +18,8 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
-from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
-from hsi_sc_nerf.plotting import STYLE, new_figure
+from hsi_sc_nerf.plotting import STYLE, logarithmic_axis, new_figure
 
 _SERIES = ("#0072b2", "#d55e00", "#00805f", "#b0568c", "#603a00", "#2f93cf", "#1c2126")
 _TEXT, _FAINT, _RULE = "#1c2126", "#5b6670", "#d9dee3"
@@ -102,9 +101,7 @@ def line_chart(
         values = [edge for c in curves for edge in ((c.y,) if c.spread is None else (c.y - c.spread, c.y + c.spread))]
         low, high = _value_range(np.concatenate(values), from_zero, logarithmic)
         if logarithmic:
-            axes.set_yscale("log")
-            axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-            axes.yaxis.set_minor_formatter(NullFormatter())
+            logarithmic_axis(axes, "y")
         axes.set_ylim(low, high)
         for index, curve in enumerate(curves):
             colour = _SERIES[index % len(_SERIES)]
