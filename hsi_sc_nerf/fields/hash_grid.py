@@ -213,18 +213,19 @@ def grid_for_resolution(box_side_m: float, pixel_footprint_m: float) -> GridSize
     """Grid of a scene box for a camera.
 
     The finest level has `CELLS_PER_PIXEL` cells a pixel; the number of levels follows from `LEVEL_GROWTH`. A table
-    has a row for every second cell that a plane through the box cuts, since density lies on surfaces.
+    has a row for every cell that a plane through the box cuts, since density lies on surfaces. With half as many,
+    cells share rows and errors are a tenth larger (docs/notes/dead_ends.md).
 
     Raises:
         ValueError: a length is not above 0.
 
     Example:
         >>> grid_for_resolution(box_side_m=0.2, pixel_footprint_m=0.001)
-        GridSize(finest=400, levels=11, log2_table=17)
+        GridSize(finest=400, levels=11, log2_table=18)
     """
     if not (box_side_m > 0.0 and pixel_footprint_m > 0.0):
         raise ValueError(f"a box of {box_side_m} m and a footprint of {pixel_footprint_m} m are not both above 0")
     finest = max(2 * COARSEST_GRID, math.ceil(CELLS_PER_PIXEL * box_side_m / pixel_footprint_m))
     levels = 1 + math.ceil(math.log(finest / COARSEST_GRID) / math.log(LEVEL_GROWTH))
     smallest, largest = LOG2_TABLE_RANGE
-    return GridSize(finest, levels, min(max(math.ceil(math.log2(finest**2 / 2.0)), smallest), largest))
+    return GridSize(finest, levels, min(max(math.ceil(math.log2(finest**2)), smallest), largest))

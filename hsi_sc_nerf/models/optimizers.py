@@ -110,9 +110,7 @@ class GuardedOptimizers(Optimizers):
                 "version; train anew."
             )
         super().__init__(config, param_groups)
-
-    def fuse(self) -> None:
-        """On a GPU: one pass of Adam over the hash grid's tables, in place of one for each of its operations."""
+        # Adam passes once over the hash grid's tables, not once for each of its operations.
         for optimizer in self.optimizers.values():
             if isinstance(optimizer, torch.optim.Adam):
                 for group in optimizer.param_groups:

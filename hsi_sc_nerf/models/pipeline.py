@@ -73,7 +73,8 @@ class SpectralPipeline(VanillaPipeline):
         ):
             raise SystemExit(
                 f"hsi-sc-nerf: {self.datamanager.get_datapath()} is not the dataset that the checkpoint was trained "
-                "on, or was processed anew since; train again, or process it with the settings of that time."
+                "on, or was processed anew since, or another version made the checkpoint; train again, or process "
+                "the session with the settings of that time."
             )
         super().load_pipeline(loaded_state, step)
 

@@ -168,8 +168,6 @@ class StagedTrainer(Trainer):
             group: [parameter for parameter in parameters if parameter.requires_grad]
             for group, parameters in optimizers.parameters.items()
         }
-        if self.pipeline.device.type == "cuda":
-            optimizers.fuse()
         return optimizers
 
     @property

@@ -111,8 +111,8 @@ def test_levels_grow_no_faster_than_they_may_and_are_not_more_than_needed(footpr
 
 
 def test_tables_hold_every_second_cell_of_a_plane_within_bounds():
-    assert 2 ** grid_for_resolution(0.2, 0.002).log2_table >= 200**2 / 2
-    assert 2 ** (grid_for_resolution(0.2, 0.002).log2_table - 1) < 200**2 / 2
+    assert 2 ** grid_for_resolution(0.2, 0.002).log2_table >= 200**2
+    assert 2 ** (grid_for_resolution(0.2, 0.002).log2_table - 1) < 200**2
     assert grid_for_resolution(0.2, 0.05).log2_table == 14
     assert grid_for_resolution(0.2, 0.0001).log2_table == 19
 
