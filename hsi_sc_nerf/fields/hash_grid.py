@@ -29,6 +29,8 @@ LEVEL_GROWTH = 1.38
 """Factor from level to level, the smallest that Müller et al. 2022 use."""
 LOG2_TABLE_RANGE = (14, 19)
 """Smallest and largest hash table of a level; 19 is nerfacto's."""
+FEW_FRAMES = 25
+"""Fewer frames support half as many rows: more would learn what no frame shows (docs/notes/dead_ends.md)."""
 # Müller et al. 2022, Eq. 4. The second prime exceeds int32: its two's complement gives the same low bits.
 _HASH_PRIMES = (1, 2654435761 - 2**32, 805459861)
 
@@ -206,26 +208,28 @@ def grid_for_dataset(dataset: PackedDataset) -> GridSize:
     """The grid that resolves in the scene box what the camera does."""
     box = dataset.scene_box_m
     distance_m = np.linalg.norm(dataset.camera_to_worlds[:, :3, 3] - box.mean(axis=0), axis=1).mean()
-    return grid_for_resolution(float((box[1] - box[0]).max()), float(distance_m) / dataset.intrinsics.fl_x)
+    side_m, footprint_m = float((box[1] - box[0]).max()), float(distance_m) / dataset.intrinsics.fl_x
+    return grid_for_resolution(side_m, footprint_m, len(dataset.frames))
 
 
-def grid_for_resolution(box_side_m: float, pixel_footprint_m: float) -> GridSize:
-    """Grid of a scene box for a camera.
+def grid_for_resolution(box_side_m: float, pixel_footprint_m: float, frames: int) -> GridSize:
+    """Grid of a scene box for a camera and a number of frames.
 
     The finest level has `CELLS_PER_PIXEL` cells a pixel; the number of levels follows from `LEVEL_GROWTH`. A table
-    has a row for every cell that a plane through the box cuts, since density lies on surfaces. With half as many,
-    cells share rows and errors are a tenth larger (docs/notes/dead_ends.md).
+    has a row for every cell that a plane through the box cuts, since density lies on surfaces; or for every second
+    one, for fewer than `FEW_FRAMES`.
 
     Raises:
         ValueError: a length is not above 0.
 
     Example:
-        >>> grid_for_resolution(box_side_m=0.2, pixel_footprint_m=0.001)
+        >>> grid_for_resolution(box_side_m=0.2, pixel_footprint_m=0.001, frames=60)
         GridSize(finest=400, levels=11, log2_table=18)
     """
     if not (box_side_m > 0.0 and pixel_footprint_m > 0.0):
         raise ValueError(f"a box of {box_side_m} m and a footprint of {pixel_footprint_m} m are not both above 0")
     finest = max(2 * COARSEST_GRID, math.ceil(CELLS_PER_PIXEL * box_side_m / pixel_footprint_m))
     levels = 1 + math.ceil(math.log(finest / COARSEST_GRID) / math.log(LEVEL_GROWTH))
+    rows = finest**2 / (2.0 if frames < FEW_FRAMES else 1.0)
     smallest, largest = LOG2_TABLE_RANGE
-    return GridSize(finest, levels, min(max(math.ceil(math.log2(finest**2)), smallest), largest))
+    return GridSize(finest, levels, min(max(math.ceil(math.log2(rows)), smallest), largest))

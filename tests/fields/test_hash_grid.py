@@ -98,26 +98,27 @@ def test_the_viewer_may_interpolate_while_training_does():
 
 
 def test_half_a_pixel_is_a_cell():
-    assert grid_for_resolution(0.2, 0.002).finest == 200
-    assert grid_for_resolution(0.2, 0.0005).finest == 800
+    assert grid_for_resolution(0.2, 0.002, 60).finest == 200
+    assert grid_for_resolution(0.2, 0.0005, 60).finest == 800
 
 
 @pytest.mark.parametrize("footprint_m", [0.003, 0.002, 0.001, 0.0004])
 def test_levels_grow_no_faster_than_they_may_and_are_not_more_than_needed(footprint_m):
-    size = grid_for_resolution(0.2, footprint_m)
+    size = grid_for_resolution(0.2, footprint_m, 60)
     growth = size.finest / COARSEST_GRID
     assert growth ** (1 / (size.levels - 1)) <= LEVEL_GROWTH + 1e-9
     assert growth ** (1 / (size.levels - 2)) > LEVEL_GROWTH
 
 
-def test_tables_hold_every_second_cell_of_a_plane_within_bounds():
-    assert 2 ** grid_for_resolution(0.2, 0.002).log2_table >= 200**2
-    assert 2 ** (grid_for_resolution(0.2, 0.002).log2_table - 1) < 200**2
-    assert grid_for_resolution(0.2, 0.05).log2_table == 14
-    assert grid_for_resolution(0.2, 0.0001).log2_table == 19
+def test_tables_hold_the_cells_of_a_plane_within_bounds_and_half_of_them_for_few_frames():
+    assert 2 ** grid_for_resolution(0.2, 0.002, 60).log2_table >= 200**2
+    assert 2 ** (grid_for_resolution(0.2, 0.002, 60).log2_table - 1) < 200**2
+    assert [grid_for_resolution(0.2, 0.002, frames).log2_table for frames in (24, 25)] == [15, 16]
+    assert grid_for_resolution(0.2, 0.05, 60).log2_table == 14
+    assert grid_for_resolution(0.2, 0.0001, 60).log2_table == 19
 
 
 def test_lengths_of_nothing_are_refused():
     for lengths in ((0.0, 0.001), (0.2, 0.0), (0.2, float("nan"))):
         with pytest.raises(ValueError, match="not both above 0"):
-            grid_for_resolution(*lengths)
+            grid_for_resolution(*lengths, 60)
