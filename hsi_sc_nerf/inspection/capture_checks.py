@@ -33,8 +33,8 @@ ACCURACY_BY_VIEWS = {
     8: (3.0, 81, 0.6, 1),
     12: (2.1, 95, 0.4, 5),
     20: (1.7, 98, 0.1, 2),
-    30: (1.4, 97, 0.5, 3),
-    60: (1.2, 97, 0.5, 2),
+    30: (1.3, 96, 0.4, 2),
+    60: (1.1, 97, 0.4, 2),
 }
 """Percent by number of views: root mean square error of the reflectance, F-score at 0.5 mm, error of the volume and
 of the area of a bruise (docs/validation/accuracy_and_time.md)."""
