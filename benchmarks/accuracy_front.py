@@ -135,7 +135,7 @@ def draw_front(path: Path, rows: Sequence[Sequence[str]]) -> None:
     curve(errors, minutes, 100.0 * ranges(" RMSE", "views"), COLOURS[1], "RMSE without the noise (% reflectance)")
     errors.set(ylabel="error (%)", ylim=(0.0, None))
     drawn = map(list.__add__, by_views.get_legend_handles_labels(), errors.get_legend_handles_labels())
-    by_views.legend(*drawn, fontsize=7, loc="upper right", bbox_to_anchor=(1.0, 0.86))
+    by_views.legend(*drawn, fontsize=7, loc="upper right", bbox_to_anchor=(1.0, 0.76))
     save_figure(figure, path)
 
 
