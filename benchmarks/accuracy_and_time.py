@@ -62,6 +62,8 @@ STEPS_A_TURN = 10
 SETTLING_TURNS = 12
 """Turns that are not timed: by then the occupancy grid has emptied most of the hull."""
 TIMED_TURNS = 8
+TIMED_RUN = 10_000
+"""Steps of the run that the timed turns are a part of."""
 _RAYS = "--pipeline.datamanager.train-num-rays-per-batch"
 _MODEL = "--pipeline.model"
 
@@ -70,7 +72,9 @@ SETTINGS: dict[str, str] = {
     DEFAULT: "",
     "2048 rays a step": f"{_RAYS} 2048",
     "8 samples a ray": f"{_MODEL}.num-nerf-samples-per-ray 8",
-    "32 samples a ray": f"{_MODEL}.num-nerf-samples-per-ray 32",
+    "16 samples a ray": f"{_MODEL}.num-nerf-samples-per-ray 16 --full-frame.samples-per-ray 16",
+    "32 samples a ray": "--full-frame.samples-per-ray 32",
+    "64 samples a ray": f"{_MODEL}.num-nerf-samples-per-ray 64",
     "every band a channel": f"{_MODEL}.head direct",
     **{f"basis of {size}": f"{_MODEL}.basis-size {size}" for size in (4, 8, 16, 32)},
     "the paper's hash grid": f"{_MODEL}.match-resolution False",
@@ -259,15 +263,18 @@ def step_seconds(runs: Mapping[str, tuple[Path, str]], common: str) -> dict[str,
         for name, (data, words) in runs.items():
             all_words = tuple(split_words(f"{common} {words}"))
             folder = str(Path(temporary, str(len(trainers))))
-            job = Job("hsi-sc-nerf", all_words, str(data), folder, 10_000, None, "cpu", (), 1, None)
+            job = Job("hsi-sc-nerf", all_words, str(data), folder, TIMED_RUN, None, "cpu", (), 1, None)
             trainers[name] = build_trainer(job)
             trainers[name]._show_progress = lambda step, psnr_db: None
         seconds = dict.fromkeys(trainers, 0.0)
         for turn in range(SETTLING_TURNS + TIMED_TURNS):
             for name, trainer in trainers.items():
                 trainer.pipeline.train()
+                # Timed turns are spread over the whole run: a step's cost differs between the stages.
+                timed = turn - SETTLING_TURNS
+                first = turn * STEPS_A_TURN if timed < 0 else int(TIMED_RUN * (timed + 0.5) / TIMED_TURNS)
                 before = time.process_time()
-                for step in range(turn * STEPS_A_TURN, (turn + 1) * STEPS_A_TURN):
+                for step in range(first, first + STEPS_A_TURN):
                     trainer.train_iteration(step)
                 if turn >= SETTLING_TURNS:
                     seconds[name] += (time.process_time() - before) / (TIMED_TURNS * STEPS_A_TURN)

@@ -133,7 +133,7 @@ def penalty():
 CASES = {
     "distortion": lambda: (separate_distortion, [random(3, 5, seed=1), *segments()]),
     "free space": lambda: (
-        lambda weights: free_space_loss(weights, torch.tensor([[0.2, 0.1, 0.1, -0.1, -0.1]]), torch.arange(3) > 0),
+        lambda weights: free_space_loss(weights, torch.tensor([[0.2, 0.1, 0.1, -0.1, -0.1]]), torch.arange(3) / 2.0),
         [random(3, 5, seed=1)],
     ),
     "weights": lambda: (light_through, [random(3, 5, 1, seed=1)]),

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE
 from hsi_sc_nerf.packed.dataset import PackedFrame
+from hsi_sc_nerf.packed.pixels import PARTLY_FREE, partly_covered
 
 MAX_MEMORY_FRACTION = 0.5
 """Cubes are kept on a GPU if they fill at most this fraction of its free memory."""
@@ -50,6 +51,7 @@ class DevicePixels:
     ) -> None:
         self.has_flagged = has_flagged
         self._masks = torch.from_numpy(masks).to(device)
+        self._partly_covered = torch.from_numpy(partly_covered(masks)).to(device)
         # PyTorch supports few operations on unsigned 16-bit integers; int16 holds the same bits.
         self._counts = torch.empty((*masks.shape, frames[0].cube().shape[2]), dtype=torch.int16, device=device)
         for held, frame in zip(self._counts, frames, strict=True):
@@ -61,7 +63,9 @@ class DevicePixels:
         """What `PixelSampler.at` gives for pixels (frame, line, sample), as tensors on the device."""
         frame, line, sample = indices.unbind(dim=-1)
         counts = self._counts[frame, line, sample].int().bitwise_and_(0xFFFF)
-        batch = {"indices": indices, "mask": self._masks[frame, line, sample, None]}
+        mask, partial = (table[frame, line, sample, None] for table in (self._masks, self._partly_covered))
+        free = torch.where(partial, PARTLY_FREE, 1.0) * ~mask
+        batch = {"indices": indices, "mask": mask, "free": free}
         if not self.has_flagged:
             return batch | {"spectral": counts.float() / self._scale}
         valid = counts != FLAGGED

@@ -109,24 +109,24 @@ def separate_distortion(
 
 
 def free_space_loss(
-    weights: Float[Tensor, "rays samples"], heights: Float[Tensor, "rays samples"], beside: Bool[Tensor, "rays"]
+    weights: Float[Tensor, "rays samples"], heights: Float[Tensor, "rays samples"], free: Float[Tensor, "rays"]
 ) -> Float[Tensor, ""]:
     """Weight above the support, summed over the rays that pass the object by and reach its support.
 
     There is nothing but air above the support beside the object. The spectra do not tell: matter of the support's own
-    spectrum in front of it changes no pixel.
+    spectrum in front of it changes no pixel. Pixels that the object covers partly count less: it may be there.
 
     Args:
         weights: weights of the samples.
         heights: heights of the samples above the support, in any unit.
-        beside: rays through pixels that the object does not cover.
+        free: how much the ray's pixel counts as free of the object: 0 on the object, 1 beside it.
 
     Example:
-        >>> free_space_loss(torch.tensor([[0.3, 0.7]]), torch.tensor([[0.01, -0.01]]), torch.tensor([True]))
+        >>> free_space_loss(torch.tensor([[0.3, 0.7]]), torch.tensor([[0.01, -0.01]]), torch.ones(1))
         tensor(0.3000)
     """
     above = heights > 0.0
-    return (weights * (above & (beside & ~above.all(dim=-1))[:, None])).sum()
+    return (weights * above * (free * ~above.all(dim=-1))[:, None]).sum()
 
 
 def _pixels_with_an_angle(

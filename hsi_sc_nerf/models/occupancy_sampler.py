@@ -32,15 +32,17 @@ class OccupancySampler(Sampler):
         every_ray: sample rays that meet no matter as well, as where something is done for each ray.
 
     Attributes:
+        samples_in_training: samples a ray while it trains, if fewer do for the stage.
         rays: of the last call, the indices of the rays that were sampled: those that meet matter. None for all.
     """
 
+    samples_in_training: int | None
     rays: Int[Tensor, "sampled"] | None
 
     def __init__(self, grid: OccupancyGrid, num_samples: int, every_ray: bool = False) -> None:
         super().__init__(num_samples)
         self.grid, self.every_ray = grid, every_ray
-        self.rays = None
+        self.samples_in_training = self.rays = None
 
     def generate_ray_samples(  # type: ignore[override]
         self, ray_bundle: RayBundle, density_fns: Sequence[object] = ()
@@ -53,10 +55,13 @@ class OccupancySampler(Sampler):
         assert ray_bundle.nears is not None
         assert ray_bundle.fars is not None
         assert self.num_samples is not None
+        count = self.num_samples
+        if self.training and self.samples_in_training is not None:
+            count = min(count, self.samples_in_training)
         device = ray_bundle.origins.device
         with torch.no_grad():
             nears, fars = ray_bundle.nears[:, 0], ray_bundle.fars[:, 0]
-            starts, ends = self.grid.sample(ray_bundle.origins, ray_bundle.directions, nears, fars, self.num_samples)
+            starts, ends = self.grid.sample(ray_bundle.origins, ray_bundle.directions, nears, fars, count)
         self.rays = None
         if device.type == "cpu" and not self.every_ray:
             met = (ends[:, -1] > nears).nonzero()[:, 0]

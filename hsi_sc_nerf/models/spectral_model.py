@@ -95,8 +95,8 @@ class SpectralModelConfig(NerfactoModelConfig):
     num_proposal_iterations: int = 0
     """Proposal networks that place the samples, as in nerfacto. 0: an occupancy grid that begins as the visual hull
     of the masks places them; it needs the scene to be a box."""
-    num_nerf_samples_per_ray: int = 16
-    """Samples a ray for the spectral field."""
+    num_nerf_samples_per_ray: int = 32
+    """Samples a ray for the spectral field; a stage may train with fewer."""
     match_resolution: bool = True
     """Size the field's hash grid by what a pixel resolves. False: by num-levels, max-res and log2-hashmap-size."""
     average_init_density: float = 0.1
@@ -105,7 +105,7 @@ class SpectralModelConfig(NerfactoModelConfig):
     """Learn an appearance of each view. Calibrated reflectance under fixed lamps needs none."""
     implementation: Literal["tcnn", "torch"] = "torch"
     """Networks and grids. "torch" works with and without a GPU."""
-    eval_num_rays_per_chunk: int = 4096
+    eval_num_rays_per_chunk: int = 2048
     """Rays rendered at a time."""
     camera_optimizer: PoseRefinementConfig = field(default_factory=PoseRefinementConfig)
     """Refinement of the measured poses."""
@@ -335,9 +335,9 @@ class SpectralModel(NerfactoModel):
         """`free_space_loss` of the rays that were sampled."""
         assert isinstance(self.proposal_sampler, OccupancySampler)
         (*_, weights), (*_, samples) = outputs["weights_list"], outputs["ray_samples_list"]
-        beside, sampled = ~batch["mask"].to(self.device)[:, 0], self.proposal_sampler.rays
+        free, sampled = batch["free"].to(self.device)[:, 0], self.proposal_sampler.rays
         heights = samples.frustums.get_positions()[..., 2] - self.support_height
-        return free_space_loss(weights[..., 0], heights, beside if sampled is None else beside[sampled])
+        return free_space_loss(weights[..., 0], heights, free if sampled is None else free[sampled])
 
     def get_image_metrics_and_images(self, outputs: dict, batch: dict) -> tuple[dict[str, float], dict[str, Tensor]]:
         """The paper's metrics of a held-out view, masked to the foreground and (``full_``) over the whole frame."""

@@ -26,6 +26,7 @@ from hsi_sc_nerf.files import atomic_write, content_of, make_folder, write_json
 from hsi_sc_nerf.models.captured_step import CapturedSteps
 from hsi_sc_nerf.models.checkpoints import checkpoint_path, link_checkpoint, read_checkpoint, write_checkpoint
 from hsi_sc_nerf.models.chosen_effects import effects_setting, resume_effects
+from hsi_sc_nerf.models.occupancy_sampler import OccupancySampler
 from hsi_sc_nerf.models.optimizers import GuardedOptimizers
 from hsi_sc_nerf.models.pipeline import SpectralPipeline
 from hsi_sc_nerf.models.presets import Preset, apply_preset
@@ -207,6 +208,8 @@ class StagedTrainer(Trainer):
         manager = self.pipeline.datamanager
         manager.foreground_ray_fraction = stage.config.foreground_ray_fraction
         manager.boundary_ray_fraction = stage.config.boundary_ray_fraction
+        if isinstance(self._model.proposal_sampler, OccupancySampler):
+            self._model.proposal_sampler.samples_in_training = stage.config.samples_per_ray
         self._freeze({group for group in self.optimizers.parameters if not stage.learns(group, position)})
         rates = self.optimizers.scale_learning_rates(lambda group: stage.lr_factor(position, group))
         sampler = self._model.proposals

@@ -35,6 +35,8 @@ class StageConfig:
     boundary_ray_fraction: float = between(0.0, 1.0, default=0.0)
     """Fraction of the other rays that pass within 3 pixels of the masks, where the object ends. It has no effect
     without a foreground ray fraction."""
+    samples_per_ray: int | None = between(1, math.inf, default=None)
+    """Samples a ray in this stage, if fewer than the model's and an occupancy grid places them. None: the model's."""
     frozen_groups: tuple[str, ...] = ()
     """Parameter groups that this stage does not change. What they learned so far stays in force, unless the pose
     refinement's mode is free-discarded."""
@@ -69,13 +71,15 @@ def full_frame_stage() -> StageConfig:
 
     A turntable's object covers less than a tenth of the pixels, and the occupancy grid bounds it from the start. Half
     of the rays are therefore drawn from the object. The others see its boundary, the container and the disc, without
-    which the object's base would swell (docs/notes/dead_ends.md).
+    which the object's base would swell (docs/notes/dead_ends.md). Samples are few: they find the surface, those of
+    the second stage its outline.
     """
     return StageConfig(
         name="full-frame",
         fraction=paper.STAGE_ITERATIONS[0] / sum(paper.STAGE_ITERATIONS),
         foreground_ray_fraction=0.5,
         boundary_ray_fraction=0.2,
+        samples_per_ray=8,
         grid_decay=0.1,
     )
 

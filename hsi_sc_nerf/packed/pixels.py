@@ -17,6 +17,9 @@ from hsi_sc_nerf.packed.cube import unpack, unpack_unflagged
 
 BOUNDARY_PX = 3
 """Width of the band of background pixels along the foreground, which decide where the object ends."""
+PARTLY_FREE = 0.3
+"""How much a background pixel that touches the foreground counts as free of the object, which may cover up to half of
+it (docs/validation/surface.md)."""
 
 
 class PixelReader:
@@ -159,16 +162,23 @@ class PixelSampler:
 
         Returns:
             ``indices`` (count, 3) int64; ``spectral`` (count, bands) float32, reflectance; ``mask`` (count, 1) bool,
-            foreground; and, if the cubes have flagged values, ``valid`` (count, bands) bool, which of ``spectral``
-            were measured (the others are 0).
+            foreground; ``free`` (count, 1) float32, how much the pixel counts as free of the object, in [0, 1]; and,
+            if the cubes have flagged values, ``valid`` (count, bands) bool, which of ``spectral`` were measured (the
+            others are 0).
         """
         frame, line, sample = indices.T
-        batch = {"indices": indices, "mask": self.masks[frame, line, sample, None]}
+        mask, partial = (table[frame, line, sample, None] for table in (self.masks, self._partly_covered))
+        free = np.where(mask, np.float32(0.0), np.where(partial, np.float32(PARTLY_FREE), np.float32(1.0)))
+        batch = {"indices": indices, "mask": mask, "free": free}
         counts = self.reader.read(indices)
         if not self._has_flagged:
             return batch | {"spectral": unpack_unflagged(counts)}
         spectral, valid = unpack(counts)
         return batch | {"spectral": spectral, "valid": valid}
+
+    @cached_property
+    def _partly_covered(self) -> Bool[np.ndarray, "frames lines samples"]:
+        return partly_covered(self.masks)
 
     @cached_property
     def _boundary(self) -> Int[np.ndarray, "count"]:
@@ -191,6 +201,11 @@ class PixelSampler:
         if self._drawn_background is not None:
             return self._drawn_background[ranks]
         return ranks + np.searchsorted(self._background_before, ranks, side="right")
+
+
+def partly_covered(masks: Bool[np.ndarray, "frames lines samples"]) -> Bool[np.ndarray, "frames lines samples"]:
+    """Background pixels that share a side with the foreground, so that the object may cover a part of them."""
+    return np.stack([dilate(mask, 3) & ~mask for mask in masks])
 
 
 def spread_over(masks: Bool[np.ndarray, "frames lines samples"], count: int) -> Int[np.ndarray, "at_most_count 3"]:

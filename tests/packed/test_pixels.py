@@ -11,7 +11,7 @@ from scipy.ndimage import distance_transform_edt
 from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, unpack, write_packed_cube
-from hsi_sc_nerf.packed.pixels import BOUNDARY_PX, PixelReader, PixelSampler, spread_over
+from hsi_sc_nerf.packed.pixels import BOUNDARY_PX, PARTLY_FREE, PixelReader, PixelSampler, spread_over
 
 SHAPE = (5, 7, 4)
 INDICES = np.array([[2, 4, 6], [0, 0, 0], [2, 1, 3], [1, 2, 2], [0, 4, 0]])
@@ -189,6 +189,18 @@ def test_fixed_pixels_are_spread_over_the_object(masks):
     assert flat == foreground[[2, 7, 11]].tolist()
     assert len(spread_over(masks, 99)) == len(foreground)
     assert spread_over(np.zeros_like(masks), 3).shape == (0, 3)
+
+
+def test_a_pixel_beside_the_object_is_free_of_it_only_in_part(tmp_path, counts, masks):
+    """A single foreground pixel: its four neighbours may hold a part of the object, its diagonal ones do not."""
+    masks = np.zeros_like(masks)
+    masks[0, 2, 2] = True
+    pixels = PixelSampler(reader_of(tmp_path, counts), masks, 1, 0, has_flagged=False)
+    lines = [2, 1, 2, 3, 2, 1, 2]
+    samples = [2, 2, 1, 2, 3, 1, 2]
+    batch = pixels.at(np.array([[0] * 6 + [1], lines, samples]).T)
+    assert batch["free"].dtype == np.float32
+    np.testing.assert_allclose(batch["free"][:, 0], [0.0, *[PARTLY_FREE] * 4, 1.0, 1.0])
 
 
 def test_given_pixels_are_read_in_their_order(sampler, counts, masks):
