@@ -50,6 +50,15 @@ def test_only_rays_that_meet_matter_are_sampled():
     }
 
 
+@pytest.mark.parametrize(("in_training", "expected"), [(None, 8), (3, 3), (20, 8)])
+def test_a_stage_may_train_with_fewer_samples_but_renders_with_all(in_training, expected):
+    sampler = OccupancySampler(ball_grid(), num_samples=8)
+    sampler.samples_in_training = in_training
+    rays = rays_along_x(torch.tensor([0.0]))
+    assert sampler.train()(rays)[0].frustums.shape == (1, expected)
+    assert sampler.eval()(rays)[0].frustums.shape == (1, 8)
+
+
 def test_a_bundle_that_meets_nothing_keeps_one_ray_without_length():
     sampler = OccupancySampler(ball_grid(), num_samples=8)
     samples, *_ = sampler(rays_along_x(torch.tensor([0.9, -0.8])))

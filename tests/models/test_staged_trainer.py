@@ -54,13 +54,16 @@ def test_two_stages_run_in_one_go(tiny_dataset, tmp_path, device):
 
 @pytest.mark.slow
 def test_what_a_stage_says_holds_in_it_alone(tiny_dataset, tmp_path, monkeypatch):
-    """Frozen groups, learning rates, the grid's decay and the paper's rays, by stage."""
+    """Frozen groups, learning rates, the grid's decay, samples a ray and the paper's rays, by stage."""
     first, second = full_frame_stage(), masked_stage()
     first.frozen_groups, first.group_lr = ("fields", "field_networks"), {"fields": (0.1, 0.1)}
     second.frozen_groups, second.foreground_ray_fraction = ("camera_opt",), 1.0
     first.grid_decay, second.grid_decay = 0.2, 3.0
+    first.samples_per_ray = 5
     made = trainer(tiny_dataset, tmp_path, full_frame=first, masked=second)
-    rates, changed, shrunk = [], [], []
+    rates, changed, shrunk, samples = [], [], [], []
+    sampler = made.pipeline.model.proposal_sampler
+    sampler.register_forward_hook(lambda _, given, found: samples.append(found[0].frustums.shape[1]))
     monkeypatch.setattr(made.pipeline.model.field, "shrink_grid", shrunk.append)
     original = made.train_iteration
 
@@ -79,6 +82,7 @@ def test_what_a_stage_says_holds_in_it_alone(tiny_dataset, tmp_path, monkeypatch
     assert {name for step, name in changed if step < 3} == {"camera_opt"}
     assert {name for step, name in changed if step >= 3} == {"fields", "field_networks"}
     assert shrunk == pytest.approx([3.0 * rate for rate in rates[3:]])  # the first stage does not learn the field
+    assert samples[:6] == [5] * 3 + [8] * 3
 
 
 @pytest.mark.slow
