@@ -30,6 +30,10 @@ from hsi_sc_nerf.fields.hash_grid import FusedHashEncoding
 
 FIRST_STEP = 100
 """Steps before the first that is timed: by then the occupancy grid has emptied most of the hull."""
+RUN_STEPS = 10_000
+"""Steps of the run over which those that are timed are spread: the stages' steps differ."""
+BLOCK_STEPS = 8
+"""Steps that are timed in a row: as many as there are from one update of the occupancy grid to the next."""
 FLOAT_BYTES = 4
 CORNERS = 8
 COPIED_FLOATS = 2**25
@@ -82,8 +86,8 @@ class StepProfile:
     """A dataset made by `hsi-sc-nerf process`."""
     words: tuple[str, ...] = ("--preset", "fast", "--pipeline.model.effects", "none")
     """As after `ns-train hsi-sc-nerf`."""
-    steps: int = 50
-    """Steps that are timed."""
+    steps: int = 64
+    """Steps that are timed; a multiple of 8."""
     threads: int = 1
     """CPU threads."""
     label: str = "pear"
@@ -95,7 +99,7 @@ class StepProfile:
         """Measure and write."""
         torch.set_num_threads(self.threads)
         with tempfile.TemporaryDirectory() as folder:
-            job = Job("hsi-sc-nerf", self.words, str(self.data), folder, None, 3600.0, "cpu", (), self.threads, None)
+            job = Job("hsi-sc-nerf", self.words, str(self.data), folder, RUN_STEPS, None, "cpu", (), self.threads, None)
             trainer = build_trainer(job)
             trainer._show_progress = lambda step, psnr_db: None
             for step in range(FIRST_STEP):
@@ -104,8 +108,11 @@ class StepProfile:
             timer, counts = PartTimer(), defaultdict(float)
             _wrap(trainer, timer, counts)
             step_of = timer.timed("rest", trainer.train_iteration)
-            for step in range(FIRST_STEP, FIRST_STEP + self.steps):
-                step_of(step)
+            blocks = self.steps // BLOCK_STEPS
+            for block in range(blocks):
+                first = FIRST_STEP + int((RUN_STEPS - FIRST_STEP) * (block + 0.5) / blocks)
+                for step in range(first, first + BLOCK_STEPS):
+                    step_of(step)
             least = least_seconds(trainer, {name: value / self.steps for name, value in counts.items()})
         total = sum(timer.seconds.values())
         rows = []
