@@ -99,7 +99,9 @@ class StepProfile:
         """Measure and write."""
         torch.set_num_threads(self.threads)
         with tempfile.TemporaryDirectory() as folder:
-            job = Job("hsi-sc-nerf", self.words, str(self.data), folder, RUN_STEPS, None, "cpu", (), self.threads, None)
+            job = Job(
+                "hsi-sc-nerf", self.words, str(self.data), folder, RUN_STEPS, None, "cpu", (), self.threads, None
+            )
             trainer = build_trainer(job)
             trainer._show_progress = lambda step, psnr_db: None
             for step in range(FIRST_STEP):
