@@ -30,11 +30,11 @@ COMPARED_PX = 40
 FEWEST_COMPARED = 8
 """Fewest frames with which a different one can be recognised."""
 ACCURACY_BY_VIEWS = {
-    8: (3.0, 81, 0.6, 1),
-    12: (2.1, 95, 0.4, 5),
-    20: (1.7, 98, 0.1, 2),
-    30: (1.3, 96, 0.4, 2),
-    60: (1.1, 97, 0.4, 2),
+    8: (2.9, 86, 1.1, 0),
+    12: (2.1, 97, 0.1, 6),
+    20: (1.6, 98, 0.1, 2),
+    30: (1.3, 98, 0.6, 1),
+    60: (1.1, 98, 0.7, 2),
 }
 """Percent by number of views: root mean square error of the reflectance, F-score at 0.5 mm, error of the volume and
 of the area of a bruise (docs/validation/accuracy_and_time.md)."""
