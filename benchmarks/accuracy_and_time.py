@@ -276,7 +276,7 @@ def step_seconds(runs: Mapping[str, tuple[Path, str]], common: str) -> dict[str,
                 before = time.process_time()
                 for step in range(first, first + STEPS_A_TURN):
                     trainer.train_iteration(step)
-                if turn >= SETTLING_TURNS:
+                if timed >= 0:
                     seconds[name] += (time.process_time() - before) / (TIMED_TURNS * STEPS_A_TURN)
     return seconds
 

@@ -86,8 +86,8 @@ class StepProfile:
     """A dataset made by `hsi-sc-nerf process`."""
     words: tuple[str, ...] = ("--preset", "fast", "--pipeline.model.effects", "none")
     """As after `ns-train hsi-sc-nerf`."""
-    steps: int = 64
-    """Steps that are timed; a multiple of 8."""
+    blocks: int = 8
+    """Blocks of 8 steps that are timed."""
     threads: int = 1
     """CPU threads."""
     label: str = "pear"
@@ -107,24 +107,23 @@ class StepProfile:
             for step in range(FIRST_STEP):
                 trainer.pipeline.train()
                 trainer.train_iteration(step)
-            timer, counts = PartTimer(), defaultdict(float)
+            timer, counts, timed_steps = PartTimer(), defaultdict(float), self.blocks * BLOCK_STEPS
             _wrap(trainer, timer, counts)
             step_of = timer.timed("rest", trainer.train_iteration)
-            blocks = self.steps // BLOCK_STEPS
-            for block in range(blocks):
-                first = FIRST_STEP + int((RUN_STEPS - FIRST_STEP) * (block + 0.5) / blocks)
+            for block in range(self.blocks):
+                first = FIRST_STEP + int((RUN_STEPS - FIRST_STEP) * (block + 0.5) / self.blocks)
                 for step in range(first, first + BLOCK_STEPS):
                     step_of(step)
-            least = least_seconds(trainer, {name: value / self.steps for name, value in counts.items()})
+            least = least_seconds(trainer, {name: value / timed_steps for name, value in counts.items()})
         total = sum(timer.seconds.values())
         rows = []
         for part in PARTS:
-            milliseconds = 1000.0 * timer.seconds[part] / self.steps
+            milliseconds = 1000.0 * timer.seconds[part] / timed_steps
             at_least = f"{1000.0 * least[part]:.2f}" if part in least else "-"
             rows.append(
                 [self.label, part, f"{milliseconds:.1f}", f"{100.0 * timer.seconds[part] / total:.0f}", at_least]
             )
-        rows.append([self.label, "a step", f"{1000.0 * total / self.steps:.1f}", "100", ""])
+        rows.append([self.label, "a step", f"{1000.0 * total / timed_steps:.1f}", "100", ""])
         titles = ["dataset", "part", "ms", "%", "at least, ms"]
         write_results("step_profile", titles, rows, keys=2, seed="0", folder=self.results)
 

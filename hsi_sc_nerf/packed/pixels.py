@@ -178,12 +178,13 @@ class PixelSampler:
 
     @cached_property
     def _partly_covered(self) -> Bool[np.ndarray, "frames lines samples"]:
-        return partly_covered(self.masks)
+        """Background pixels of which the object may cover a part."""
+        return beside_foreground(self.masks, 1)
 
     @cached_property
     def _boundary(self) -> Int[np.ndarray, "count"]:
         """Background pixels within ``BOUNDARY_PX`` of the foreground (flat indices)."""
-        return np.flatnonzero(np.stack([dilate(mask, 2 * BOUNDARY_PX + 1) & ~mask for mask in self.masks]))
+        return np.flatnonzero(beside_foreground(self.masks, BOUNDARY_PX))
 
     @property
     def _background_size(self) -> int:
@@ -203,9 +204,11 @@ class PixelSampler:
         return ranks + np.searchsorted(self._background_before, ranks, side="right")
 
 
-def partly_covered(masks: Bool[np.ndarray, "frames lines samples"]) -> Bool[np.ndarray, "frames lines samples"]:
-    """Background pixels that share a side with the foreground, so that the object may cover a part of them."""
-    return np.stack([dilate(mask, 3) & ~mask for mask in masks])
+def beside_foreground(
+    masks: Bool[np.ndarray, "frames lines samples"], width_px: int
+) -> Bool[np.ndarray, "frames lines samples"]:
+    """Background pixels within ``width_px`` of the foreground; with 1, those that share a side with it."""
+    return np.stack([dilate(mask, 2 * width_px + 1) & ~mask for mask in masks])
 
 
 def spread_over(masks: Bool[np.ndarray, "frames lines samples"], count: int) -> Int[np.ndarray, "at_most_count 3"]:
