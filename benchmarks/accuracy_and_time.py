@@ -41,7 +41,7 @@ from hsi_sc_nerf.analysis.library import SpectralLibrary
 from hsi_sc_nerf.analysis.size import size_of
 from hsi_sc_nerf.analysis.spectral_mesh import with_spectra
 from hsi_sc_nerf.analysis.traits import classified, region_spectrum
-from hsi_sc_nerf.benchmark.configurations import CONFIGURATIONS, own_configuration, split_words
+from hsi_sc_nerf.benchmark.configurations import own_configuration, split_words
 from hsi_sc_nerf.benchmark.run import Job, build_trainer
 from hsi_sc_nerf.evaluation.comparison import CompareConfig
 from hsi_sc_nerf.evaluation.spatial import Surface, score_at
@@ -88,14 +88,6 @@ SETTINGS: dict[str, str] = {
     "view dependence": f"{_MODEL}.effects view_dependence",
     "still chamber": f"{_MODEL}.effects still_chamber",
     "all three effects": f"{_MODEL}.effects view_dependence,still_chamber,pose_refinement",
-    "no effects": f"{_MODEL}.effects none",
-    "unbounded scene": CONFIGURATIONS["ours-unbounded-scene"][1],
-    "proposal networks": CONFIGURATIONS["ours-proposal-networks"][1],
-    "nerfacto's distortion loss": CONFIGURATIONS["ours-nerfacto-distortion"][1],
-    "whole frames in the first stage": CONFIGURATIONS["ours-whole-frames"][1],
-    "no rays beside the object": CONFIGURATIONS["ours-foreground-only"][1],
-    "no boundary rays": CONFIGURATIONS["ours-no-boundary-rays"][1],
-    "constant learning rates": CONFIGURATIONS["ours-constant-rate"][1],
 }
 BUDGETS_S = (10, 20, 40, 80, 160)
 VIEWS = (8, 12, 20, 30, 60)
