@@ -16,8 +16,8 @@ RAYS = "pipeline.datamanager.train_num_rays_per_batch"
 PRESETS: Mapping[Device, Mapping[Preset, Mapping[str, int]]] = {
     "cpu": {
         "fast": {ITERATIONS: 800, RAYS: 1024},
-        "balanced": {ITERATIONS: 4000, RAYS: 1024},
-        "best": {ITERATIONS: 16_000, RAYS: 1024},
+        "balanced": {ITERATIONS: 2400, RAYS: 1024},
+        "best": {ITERATIONS: 4000, RAYS: 1024},
     },
     "cuda": {
         "fast": {ITERATIONS: 1000, RAYS: 2048},
