@@ -16,6 +16,8 @@ DEFAULT = "default"
 """Name of the row that the others are compared with."""
 CAPTURE_SECONDS = 120
 """Of a view at the instrument: a SPECIM IQ takes about two minutes."""
+CLOSEST_TICKS = 1.4
+"""Ratio of two training times whose labels would touch."""
 
 TITLES = (
     *("part", "", "training, s", "steps", "memory, MiB", "SAM, rad", "RMSE", "without the noise: SAM"),
@@ -110,7 +112,10 @@ def draw_front(path: Path, rows: Sequence[Sequence[str]]) -> None:
         at, others = (ranges(name, "settings")[:, 0] for name in ("training, s", title))
         by_time.plot(at, others, "x", color=colour, markersize=4, label=f"{title.split()[-1]}, one setting changed")
     by_time.set(xscale="log", yscale="log", xlabel="training (s of one core)", ylabel="error without the noise")
-    ticks = [second for second in seconds if second not in ranges("training, s", "presets")[:1, 0]]
+    ticks: list[float] = []
+    for second in seconds:
+        if not ticks or second > CLOSEST_TICKS * ticks[-1]:
+            ticks.append(second)
     by_time.set_xticks(ticks, [f"{second:.0f}" for second in ticks])
     for name, second, error in zip(
         [row[1] for row in by_seconds if row[0] == "presets"],
