@@ -94,7 +94,7 @@ class TraitsAccuracy:
         errors = {name: error for name, _, _, error in (*sizes, *classes)}
         cells = [*(errors[name] for name in SIZES.values()), errors[ALONE], median, worst]
         is_bruised = f"bruise {CLASSIFIED[-1]}" in errors
-        cells += [errors[f"bruise {how}"] if is_bruised else "" for how in CLASSIFIED]
+        cells += [errors.get(f"bruise {how}", "") if is_bruised else "" for how in CLASSIFIED]
         write_results("traits_accuracy", COLUMNS, [[self.name, *cells]], keys=1, folder=self.results)
 
 
