@@ -161,7 +161,8 @@ def _error(trainer: Any) -> float:
     manager, model = trainer.pipeline.datamanager, trainer.pipeline.model
     fraction = 0.5 if manager.train_pixel_sampler.masks.any() else None
     batch = manager.train_pixel_sampler.sample(10**6, fraction)
-    rays, tensors = manager._with_rays(batch, manager._train_rays)
+    tensors = {name: torch.from_numpy(values) for name, values in batch.items()}
+    rays = manager._train_rays(tensors["indices"])
     model.eval()
     with torch.no_grad():
         found = model(rays.to(model.device))["spectral"]

@@ -116,6 +116,7 @@ hsi_sc_nerf_paper = MethodSpecification(
                 head="direct",
                 effects="view_dependence",
                 background="last-sample",
+                supersample_outline=False,
                 angular_loss="cosine",
                 angular_loss_mult=paper.ANGULAR_LOSS_WEIGHT,
                 distortion_loss_mult=paper.DISTORTION_LOSS_WEIGHT,

@@ -15,7 +15,8 @@ from nerfstudio.cameras.rays import Frustums, RaySamples
 
 from hsi_sc_nerf.evaluation import spectral_metrics as metrics
 from hsi_sc_nerf.models.compositing import BasisDecoder, SpectralRenderer
-from hsi_sc_nerf.models.losses import angle_loss, angular_loss, hsi_loss, separate_distortion
+from hsi_sc_nerf.models.density_losses import separate_distortion
+from hsi_sc_nerf.models.losses import angle_loss, angular_loss, hsi_loss
 from hsi_sc_nerf.numerics import one_minus_cosine, safe_ratio, spectral_angle
 
 DTYPES = [torch.float16, torch.bfloat16, torch.float32]

@@ -21,7 +21,7 @@ from hsi_sc_nerf.fields.spectral_field import CoefficientGain, density_of
 from hsi_sc_nerf.geometry.camera import cross_matrix, look_at
 from hsi_sc_nerf.models.backgrounds import interpolate_image
 from hsi_sc_nerf.models.compositing import BasisDecoder, SpectralRenderer
-from hsi_sc_nerf.models.losses import free_space_loss, separate_distortion
+from hsi_sc_nerf.models.density_losses import free_space_loss, separate_distortion
 from hsi_sc_nerf.models.pose_refinement import PoseRefinementConfig
 
 BOX = torch.tensor([[-1.0, -0.5, -1.0], [1.0, 0.5, 0.2]])

@@ -8,15 +8,15 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 import tyro
-from jaxtyping import Shaped
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 
+from hsi_sc_nerf.data.camera_rays import CameraRays
 from hsi_sc_nerf.data.dataparser import SpectralDataParserConfig
-from hsi_sc_nerf.data.device_pixels import CameraRays, DevicePixels, fits_on_gpu
+from hsi_sc_nerf.data.device_pixels import DevicePixels, fits_on_gpu
 from hsi_sc_nerf.errors import one_sentence
 from hsi_sc_nerf.packed.cube import unpack, unpack_unflagged
 from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
@@ -25,6 +25,10 @@ from hsi_sc_nerf.settings_file import between, check_options
 
 FROM_CHECKPOINT = "from_checkpoint"
 """Metadata of the training frames: whether a checkpoint replaces what a model finds in them before training."""
+
+OUTLINE_DENSITY = 0.5
+"""How often pixels on the outline are drawn compared with others, if four rays show each: half as often, training is
+as good (docs/notes/dead_ends.md)."""
 
 
 @dataclass
@@ -92,6 +96,8 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
         foreground_ray_fraction: fraction of the training rays that hit the foreground; None for whole frames. The
             trainer sets it by stage.
         boundary_ray_fraction: fraction of the others that pass just beside the foreground; likewise.
+        supersample_outline: give `QUARTERS` rays for each training pixel on the outline of the foreground; these are
+            the last of a batch. The pipeline sets it for training.
     """
 
     config: SpectralDataManagerConfig
@@ -99,6 +105,7 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
     eval_pixel_sampler: PixelSampler  # type: ignore[assignment]
     foreground_ray_fraction: float | None = None
     boundary_ray_fraction: float = 0.0
+    supersample_outline: bool = False
 
     def create_train_dataset(self) -> SpectralDataset:
         """The training frames; their metadata tell whether the model's weights will be those of a checkpoint."""
@@ -128,24 +135,29 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
         )
 
     def next_train(self, step: int) -> tuple[RayBundle, dict]:
-        """The training batch of ``step``: the same for the same step, stage and seed.
+        """The rays and pixels of ``step``: the same for the same step, stage and seed.
 
         nerfstudio's exporters ask for step 0 again and again: they get other pixels of the object each time.
         """
         self.train_count += 1
         if self.test_mode != "val":  # nerfstudio's name for training
             step, self.foreground_ray_fraction = self.train_count, 1.0
+        sampler = self.train_pixel_sampler
+        density = OUTLINE_DENSITY if self.supersample_outline else 1.0
+        fractions = (self.foreground_ray_fraction, self.boundary_ray_fraction, density)
+        pixels, on_outline = sampler.draw(step, *fractions)
+        quartered = on_outline if self.supersample_outline else 0
+        indices = torch.from_numpy(pixels)
         if self._held is not None:
-            pixels = self.train_pixel_sampler.draw(step, self.foreground_ray_fraction, self.boundary_ray_fraction)
-            indices = torch.from_numpy(pixels).pin_memory().to(self.device, non_blocking=True)
-            return self._train_rays(indices), self._held(indices)
-        batch = self.train_pixel_sampler.sample(step, self.foreground_ray_fraction, self.boundary_ray_fraction)
-        return self._with_rays(batch, self._train_rays)
+            indices = indices.pin_memory().to(self.device, non_blocking=True)
+            return self._train_rays(indices, quartered), self._held(indices)
+        return self._train_rays(indices, quartered), _tensors(sampler.at(pixels))
 
     def next_eval(self, step: int) -> tuple[RayBundle, dict]:
         """Random pixels of held-out views."""
         self.eval_count += 1
-        return self._with_rays(self.eval_pixel_sampler.sample(step), self._eval_rays)
+        batch = _tensors(self.eval_pixel_sampler.sample(step))
+        return self._eval_rays(batch["indices"]), batch
 
     def _pixel_sampler(self, dataset: SpectralDataset, num_rays: int) -> PixelSampler:
         packed: PackedDataset = dataset.metadata["dataset"]
@@ -157,8 +169,6 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
             has_flagged=dataset.has_flagged,
         )
 
-    def _with_rays(
-        self, pixels: dict[str, Shaped[np.ndarray, "rays ..."]], generator: CameraRays
-    ) -> tuple[RayBundle, dict]:
-        batch = {key: torch.from_numpy(value) for key, value in pixels.items()}
-        return generator(batch["indices"]), batch
+
+def _tensors(pixels: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
+    return {key: torch.from_numpy(value) for key, value in pixels.items()}

@@ -1,4 +1,4 @@
-"""Training pixels and rays looked up in tables: of rays on any device, of pixels in GPU memory.
+"""Training pixels looked up in GPU memory.
 
 A GPU trains a step in a few milliseconds. Reading some thousand pixels from files takes longer, and every transfer
 makes processor and GPU wait for each other.
@@ -11,8 +11,6 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from jaxtyping import Bool, Int
-from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE
@@ -70,37 +68,3 @@ class DevicePixels:
             return batch | {"spectral": counts.float() / self._scale}
         valid = counts != FLAGGED
         return batch | {"spectral": counts.float() / self._scale * valid, "valid": valid}
-
-
-class CameraRays:
-    """Rays through pixel centres, equal to those of nerfstudio's `RayGenerator`, from a table.
-
-    All frames are of one camera: its rays are computed once and rotated by each frame's pose. nerfstudio takes away
-    the lens distortion of every batch anew, in a thousand small operations.
-
-    Args:
-        cameras: cameras of the frames, on the device.
-    """
-
-    def __init__(self, cameras: Cameras) -> None:
-        first = cameras.generate_rays(camera_indices=0)
-        assert first.metadata is not None
-        self._poses = cameras.camera_to_worlds.clone()
-        self._metadata = {key: value.clone() for key, value in (cameras.metadata or {}).items()}
-        self._in_camera = first.directions @ self._poses[0, :, :3]  # R^T d
-        self._areas, self._norms = first.pixel_area, first.metadata["directions_norm"]
-
-    def __call__(self, indices: Int[Tensor, "count 3"]) -> RayBundle:
-        """Rays of pixels (frame, line, sample)."""
-        frame, line, sample = indices.unbind(dim=-1)
-        poses = self._poses[frame]
-        # A sum, because a GPU may compute a matrix product with fewer digits.
-        directions = (poses[:, :, :3] * self._in_camera[line, sample][:, None]).sum(dim=-1)
-        metadata = {key: value[frame] for key, value in self._metadata.items()}
-        return RayBundle(
-            origins=poses[:, :, 3],
-            directions=directions,
-            pixel_area=self._areas[line, sample],
-            camera_indices=frame[:, None],
-            metadata={"directions_norm": self._norms[line, sample], **metadata},
-        )

@@ -64,7 +64,7 @@ class CapturedSteps:
     def __init__(self, model: SpectralModel, parameters: Sequence[Parameter]) -> None:
         self._model, self._parameters = model, tuple(parameters)
         self._steps: dict[Hashable, _Captured] = {}
-        self._inputs: dict[str, Tensor] = {}
+        self._inputs: dict[int, dict[str, Tensor]] = {}
         self._pool: Any = None
         self._anneal = torch.ones((), device=model.device)
 
@@ -76,11 +76,11 @@ class CapturedSteps:
         Args:
             kind: what else the step's operations depend on: stage, frozen parameters. Not the annealing of the
                 proposals, which is handed over by its value.
-            rays: rays of the batch, all of them with the same parts in every call.
+            rays: rays of the batch, all of them with the same parts in every call; stages may differ in their number.
             batch: tensors on the device, likewise.
             seed: draws the step's random numbers anew; called before each pass.
         """
-        self._load(rays, batch)
+        inputs = self._loaded(rays, batch)
         sampler = self._model.proposals
         proposals_learn = False
         if sampler is not None:
@@ -88,9 +88,9 @@ class CapturedSteps:
             # As the sampler will say itself, in the steps that are not captured.
             proposals_learn = counter > sampler.update_sched(sampler._step) or sampler._step < 10
             self._anneal.fill_(float(anneal))
-        kind = (kind, proposals_learn)
+        kind = (kind, proposals_learn, len(rays))
         if kind not in self._steps:
-            self._steps[kind] = self._capture(seed)
+            self._steps[kind] = self._capture(inputs, seed)
         if sampler is not None:
             sampler._anneal, sampler._steps_since_update = anneal, 0 if proposals_learn else counter
         captured = self._steps[kind]
@@ -100,19 +100,22 @@ class CapturedSteps:
             parameter.grad = gradient
         return captured.result
 
-    def _load(self, rays: RayBundle, batch: Mapping[str, Tensor]) -> None:
+    def _loaded(self, rays: RayBundle, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The inputs of the graphs of this many rays, with these values."""
         new = {f"rays/{name}": getattr(rays, name) for name in ("origins", "directions", "pixel_area")}
         new["rays/camera_indices"] = rays.camera_indices
         new |= {f"metadata/{name}": value for name, value in rays.metadata.items()}
         new |= {f"batch/{name}": value for name, value in batch.items()}
-        if not self._inputs:
-            self._inputs = {name: value.to(self._model.device, copy=True) for name, value in new.items()}
+        if len(rays) not in self._inputs:
+            self._inputs[len(rays)] = {name: value.to(self._model.device, copy=True) for name, value in new.items()}
+        inputs = self._inputs[len(rays)]
         for name, value in new.items():
-            self._inputs[name].copy_(value, non_blocking=True)
+            inputs[name].copy_(value, non_blocking=True)
+        return inputs
 
-    def _pass(self) -> Result:
+    def _pass(self, inputs: Mapping[str, Tensor]) -> Result:
         parts: dict[str, dict[str, Tensor]] = {"rays": {}, "metadata": {}, "batch": {}}
-        for name, value in self._inputs.items():
+        for name, value in inputs.items():
             kind, _, key = name.partition("/")
             parts[kind][key] = value
         for parameter in self._parameters:
@@ -121,7 +124,7 @@ class CapturedSteps:
             self._model, RayBundle(**parts["rays"], metadata=parts["metadata"]), parts["batch"]
         )
 
-    def _capture(self, seed: Callable[[], object]) -> _Captured:
+    def _capture(self, inputs: Mapping[str, Tensor], seed: Callable[[], object]) -> _Captured:
         sampler = self._model.proposals
         counter = 0
         if sampler is not None:
@@ -139,11 +142,11 @@ class CapturedSteps:
             for _ in range(_WARM_UP_PASSES):
                 rewind()
                 seed()
-                self._pass()
+                self._pass(inputs)
         torch.cuda.current_stream().wait_stream(side)
         graph = torch.cuda.CUDAGraph()
         rewind()
         with torch.cuda.graph(graph, pool=self._pool):
-            result = self._pass()
+            result = self._pass(inputs)
         self._pool = self._pool or graph.pool()
         return _Captured(graph, result, tuple(parameter.grad for parameter in self._parameters))

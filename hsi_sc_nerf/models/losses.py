@@ -1,6 +1,6 @@
-"""Losses as pure functions: the paper's two (section "Loss Function"), the spectral angle itself, and of weights.
+"""Spectral losses as pure functions: the paper's two (section "Loss Function"), and the spectral angle itself.
 
-Every spectral loss is a float32 mean over the pixels that count, and 0 with gradient 0 if none does. Values and
+Every loss is a float32 mean over the pixels that count, and 0 with gradient 0 if none does. Values and
 gradients are finite for any finite spectra, float16 included (``hsi_sc_nerf.numerics``). Where ``valid`` is given,
 values of the target that are no measurements change neither the loss nor its gradient.
 """
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -85,48 +84,6 @@ def angle_loss(
     """
     p, t, counted = _pixels_with_an_angle(predicted, target, valid)
     return narrow(masked_mean(spectral_angle(p, t), counted), predicted, target)
-
-
-def separate_distortion(
-    weights: Float[Tensor, "rays samples"], starts: Float[Tensor, "rays samples"], ends: Float[Tensor, "rays samples"]
-) -> Float[Tensor, "rays"]:
-    """Distortion of the weights along each ray (Barron et al. 2022, Eq. 15), of samples that may lie apart.
-
-    The mean distance between two points of the ray that are drawn by its weights, unnormalised: it is small where the
-    weights are concentrated.
-
-    Args:
-        weights: weights of the samples.
-        starts: starts of the samples, in order.
-        ends: likewise.
-    """
-    middles = (starts + ends) / 2.0
-    # Samples are in order: pairs are summed once, by what lies before each sample.
-    before = torch.cumsum(weights, dim=-1) - weights
-    moment_before = torch.cumsum(weights * middles, dim=-1) - weights * middles
-    between = 2.0 * (weights * (middles * before - moment_before)).sum(dim=-1)
-    return between + (weights.square() * (ends - starts)).sum(dim=-1) / 3.0
-
-
-def free_space_loss(
-    weights: Float[Tensor, "rays samples"], heights: Float[Tensor, "rays samples"], free: Float[Tensor, "rays"]
-) -> Float[Tensor, ""]:
-    """Weight above the support, summed over the rays that pass the object by and reach its support.
-
-    There is nothing but air above the support beside the object. The spectra do not tell: matter of the support's own
-    spectrum in front of it changes no pixel. Pixels that the object covers partly count less: it may be there.
-
-    Args:
-        weights: weights of the samples.
-        heights: heights of the samples above the support, in any unit.
-        free: how much the ray's pixel counts as free of the object: 0 on the object, 1 beside it.
-
-    Example:
-        >>> free_space_loss(torch.tensor([[0.3, 0.7]]), torch.tensor([[0.01, -0.01]]), torch.ones(1))
-        tensor(0.3000)
-    """
-    above = heights > 0.0
-    return (weights * above * (free * ~above.all(dim=-1))[:, None]).sum()
 
 
 def _pixels_with_an_angle(

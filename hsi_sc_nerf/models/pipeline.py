@@ -42,8 +42,11 @@ class SpectralPipeline(VanillaPipeline):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.register_buffer(_FRAMES, digest_of_frames(self.datamanager))
-        grid = cast(SpectralModel, self.model).occupancy
-        if grid is not None and self.test_mode == "val":  # nerfstudio's name for training
+        if self.test_mode != "val":  # nerfstudio's name for training
+            return
+        model = cast(SpectralModel, self.model)
+        self.datamanager.supersample_outline = model.config.supersample_outline
+        if (grid := model.occupancy) is not None:
             metadata = self.datamanager.train_dataparser_outputs.metadata
             pixels = pixels_with_matter(grid, metadata["dataset"], metadata["frames"])
             self.datamanager.train_pixel_sampler.restrict_background(pixels)

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-import numpy as np
 import torch
 from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.field_components.spatial_distortions import SceneContraction
 from nerfstudio.model_components.losses import distortion_loss, interlevel_loss
@@ -38,19 +39,17 @@ from hsi_sc_nerf.models.backgrounds import make_background
 from hsi_sc_nerf.models.build_field import build_field, build_proposals
 from hsi_sc_nerf.models.chosen_effects import chosen_effects, require_effects
 from hsi_sc_nerf.models.compositing import BasisDecoder, SpectralRenderer
-from hsi_sc_nerf.models.losses import angle_loss, angular_loss, free_space_loss, hsi_loss, separate_distortion
+from hsi_sc_nerf.models.density_losses import FREE_SPACE_WEIGHT, mean_distortion, mean_free_space, support_softness
+from hsi_sc_nerf.models.losses import angle_loss, angular_loss, hsi_loss
 from hsi_sc_nerf.models.occupancy_sampler import OccupancySampler, build_occupancy
 from hsi_sc_nerf.models.optimizers import with_network_group
 from hsi_sc_nerf.models.pose_refinement import PoseRefinement, PoseRefinementConfig
+from hsi_sc_nerf.models.supersampling import mean_over_pixels, supersampled_view
 from hsi_sc_nerf.models.view_images import view_images
 from hsi_sc_nerf.numerics import safe_log10
 from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.processing.spectral_subspace import training_subspace
 
-FREE_SPACE_WEIGHT = 0.01
-"""Weight of the loss of matter above the support beside the object (docs/validation/surface.md)."""
-SUPPORT_SOFTNESS_M = 0.002
-"""The support's own density reaches this far above it. Without a known container, its height is known too badly."""
 METRIC_STRIDE = 8
 """The metrics of a batch are those of every so many of its rays: they are drawn, and nothing learns from them."""
 
@@ -73,6 +72,8 @@ class SpectralModelConfig(NerfactoModelConfig):
     background: Literal["chamber", "last-sample"] = "chamber"
     """Spectrum of the light that the object lets through. chamber: the chamber's. last-sample: that of the last
     sample of the ray, as in nerfacto."""
+    supersample_outline: bool = True
+    """Four rays for a pixel on the object's outline, which shows the object and what is behind it, instead of one."""
     angular_loss: Literal["cosine", "angle"] = "angle"
     """Loss of the spectral angle. cosine: one minus its cosine (the paper), whose gradient vanishes at small angles.
     angle: the angle in radians, whose weight has to be about ten times smaller."""
@@ -170,9 +171,9 @@ class SpectralModel(NerfactoModel):
         else:
             grid = build_occupancy(dataset, metadata["frames"], self.scene_box.aabb, from_checkpoint)
             self.proposal_sampler = OccupancySampler(grid, config.num_nerf_samples_per_ray, config.predict_normals)
-        base, top = metadata["object_box"][:, 2].tolist()
-        softness = SUPPORT_SOFTNESS_M * (top - base) / float(np.ptp(dataset.object_box_m[:, 2]))
+        base, softness = metadata["object_box"][0, 2].item(), support_softness(dataset, metadata["object_box"])
         self.support_height = None if dataset.container is None else base + softness
+        self.object_base = base + softness / 2.0
         self.field = build_field(
             config,
             len(dataset.wavelengths_nm),
@@ -202,7 +203,6 @@ class SpectralModel(NerfactoModel):
             if config.background == "last-sample"
             else make_background(dataset, metadata["frames"], picture=picture, from_checkpoint=from_checkpoint)
         )
-
         self.renderer_rgb = SpectralRenderer(last_sample_behind=self.background is None)
         self.renderer_accumulation = AccumulationRenderer()
         self.renderer_depth = DepthRenderer(method="median")
@@ -264,6 +264,13 @@ class SpectralModel(NerfactoModel):
         return outputs
 
     @torch.no_grad()
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
+        """nerfstudio's, with the object's outline supersampled."""
+        if not self.config.supersample_outline:
+            return super().get_outputs_for_camera(camera, obb_box)
+        return supersampled_view(self.get_outputs_for_camera_ray_bundle, camera, self.object_base, obb_box)
+
+    @torch.no_grad()
     def depth_and_opacity(self, ray_bundle: RayBundle) -> tuple[Float[Tensor, "rays 1"], Float[Tensor, "rays 1"]]:
         """Outputs ``depth`` and ``accumulation`` of measured rays in evaluation, without rendering a spectrum."""
         rays = self.collider(ray_bundle)  # type: ignore[misc]
@@ -290,18 +297,17 @@ class SpectralModel(NerfactoModel):
             target, valid = self._measured(batch)
             some = slice(None, None, METRIC_STRIDE)
             # The metrics take images: the batch is one of a single line.
-            images = (outputs["spectral"][None, some], target[None, some])
+            spectral = mean_over_pixels(outputs["spectral"], len(target))
+            images = (spectral[None, some], target[None, some])
             some_valid = None if valid is None else valid[None, some]
             metrics = {"sam": spectral_angle_mapper(*images, valid=some_valid)}
             metrics["rmse"] = spectral_rmse(*images, valid=some_valid)
             metrics["psnr"] = -20.0 * safe_log10(metrics["rmse"])
         if self.training:
-            (*_, weights), (*_, samples) = outputs["weights_list"], outputs["ray_samples_list"]
-            if self.occupancy is None:
-                metrics["distortion"] = distortion_loss([weights], [samples])
-            else:  # the mean over all rays, and those that were not sampled have none
-                ends = (samples.frustums.starts[..., 0], samples.frustums.ends[..., 0])
-                metrics["distortion"] = separate_distortion(weights[..., 0], *ends).sum() / len(target)
+            if isinstance(self.proposal_sampler, OccupancySampler):
+                metrics["distortion"] = mean_distortion(self.proposal_sampler, outputs, len(target))
+            else:
+                metrics["distortion"] = distortion_loss(outputs["weights_list"], outputs["ray_samples_list"])
         self.camera_optimizer.get_metrics_dict(metrics)
         return metrics
 
@@ -309,35 +315,29 @@ class SpectralModel(NerfactoModel):
         """The paper's composite loss (section "Loss Function"); a term of weight zero is not computed."""
         config = self.config
         target, valid = self._measured(batch)
+        spectral = mean_over_pixels(outputs["spectral"], len(target))
         losses = {}
         if config.hsi_loss_mult > 0:
-            losses["hsi_loss"] = config.hsi_loss_mult * hsi_loss(outputs["spectral"], target, valid=valid)
+            losses["hsi_loss"] = config.hsi_loss_mult * hsi_loss(spectral, target, valid=valid)
         if config.angular_loss_mult > 0:
             loss = angular_loss if config.angular_loss == "cosine" else angle_loss
-            losses["angular_loss"] = config.angular_loss_mult * loss(outputs["spectral"], target, valid=valid)
+            losses["angular_loss"] = config.angular_loss_mult * loss(spectral, target, valid=valid)
         if not self.training:
             return losses
         assert metrics_dict is not None
-        if self.occupancy is None:
-            losses["interlevel_loss"] = config.interlevel_loss_mult * interlevel_loss(
-                outputs["weights_list"], outputs["ray_samples_list"]
-            )
+        if not isinstance(self.proposal_sampler, OccupancySampler):
+            interlevel = interlevel_loss(outputs["weights_list"], outputs["ray_samples_list"])
+            losses["interlevel_loss"] = config.interlevel_loss_mult * interlevel
         elif self.support_height is not None:
-            losses["free_space_loss"] = FREE_SPACE_WEIGHT * self._free_space(outputs, batch) / len(target)
+            free = batch["free"].to(self.device)[:, 0]
+            mean = mean_free_space(self.proposal_sampler, outputs, free, self.support_height)
+            losses["free_space_loss"] = FREE_SPACE_WEIGHT * mean
         losses["distortion_loss"] = config.distortion_loss_mult * metrics_dict["distortion"]
         if config.predict_normals:
             losses["orientation_loss"] = config.orientation_loss_mult * outputs["rendered_orientation_loss"].mean()
             losses["pred_normal_loss"] = config.pred_normal_loss_mult * outputs["rendered_pred_normal_loss"].mean()
         self.camera_optimizer.get_loss_dict(losses)
         return losses
-
-    def _free_space(self, outputs: dict, batch: dict) -> Float[Tensor, ""]:
-        """`free_space_loss` of the rays that were sampled."""
-        assert isinstance(self.proposal_sampler, OccupancySampler)
-        (*_, weights), (*_, samples) = outputs["weights_list"], outputs["ray_samples_list"]
-        free, sampled = batch["free"].to(self.device)[:, 0], self.proposal_sampler.rays
-        heights = samples.frustums.get_positions()[..., 2] - self.support_height
-        return free_space_loss(weights[..., 0], heights, free if sampled is None else free[sampled])
 
     def get_image_metrics_and_images(self, outputs: dict, batch: dict) -> tuple[dict[str, float], dict[str, Tensor]]:
         """The paper's metrics of a held-out view, masked to the foreground and (``full_``) over the whole frame."""

@@ -105,18 +105,25 @@ class PixelSampler:
         self._drawn_background: Int[np.ndarray, "count"] | None = None
 
     def restrict_background(self, pixels: Bool[np.ndarray, "frames lines samples"]) -> None:
-        """From now on, draw background pixels among these alone: those whose rays can meet something."""
-        self._drawn_background = np.flatnonzero(pixels & ~self.masks)
+        """From now on, draw background pixels off the outline among these alone: those whose rays can meet something.
+
+        Pixels on the outline are drawn as a part of the boundary.
+        """
+        self._drawn_background = np.flatnonzero(pixels & ~self.masks & ~self._partly_covered)
 
     def sample(
         self, step: int, foreground_ray_fraction: float | None = None, boundary_ray_fraction: float = 0.0
     ) -> dict[str, np.ndarray]:
         """One batch: `at` the pixels that `draw` gives."""
-        return self.at(self.draw(step, foreground_ray_fraction, boundary_ray_fraction))
+        return self.at(self.draw(step, foreground_ray_fraction, boundary_ray_fraction)[0])
 
     def draw(
-        self, step: int, foreground_ray_fraction: float | None = None, boundary_ray_fraction: float = 0.0
-    ) -> Int[np.ndarray, "count 3"]:
+        self,
+        step: int,
+        foreground_ray_fraction: float | None = None,
+        boundary_ray_fraction: float = 0.0,
+        outline_density: float = 1.0,
+    ) -> tuple[Int[np.ndarray, "count 3"], int]:
         """The pixels (frame, line, sample) of one batch.
 
         Args:
@@ -125,6 +132,11 @@ class PixelSampler:
                 from the background. None draws evenly from whole frames.
             boundary_ray_fraction: fraction of the background pixels drawn from within ``BOUNDARY_PX`` of the
                 foreground, in [0, 1].
+            outline_density: how often pixels on the outline are drawn compared with others.
+
+        Returns:
+            The pixels, and how many of them, the last, are drawn from the outline: as many in every step with the
+            same fractions; 0 for whole frames.
 
         Raises:
             InputError: the batch needs foreground or background pixels and the masks have none.
@@ -133,7 +145,7 @@ class PixelSampler:
         count = self.num_rays_per_batch
         if foreground_ray_fraction is None:
             flat = rng.integers(0, self.masks.size, count)
-            return np.stack(np.unravel_index(flat, self.masks.shape), axis=1)
+            return np.stack(np.unravel_index(flat, self.masks.shape), axis=1), 0
         in_foreground = round(count * foreground_ray_fraction)
         if in_foreground > 0 and len(self._foreground) == 0:
             raise InputError(
@@ -141,7 +153,7 @@ class PixelSampler:
                 "report/ in the dataset and process again."
             )
         on_boundary = 0
-        if boundary_ray_fraction > 0.0 and len(self._boundary) > 0:
+        if boundary_ray_fraction > 0.0 and sum(map(len, self._boundary)) > 0:
             on_boundary = round((count - in_foreground) * boundary_ray_fraction)
         in_background, background_size = count - in_foreground - on_boundary, self._background_size
         if in_background > 0 and background_size == 0:
@@ -149,13 +161,11 @@ class PixelSampler:
                 "the masks of all training frames cover whole images, so that nothing tells where the object "
                 "ends; look at report/ in the dataset and process again with a larger --masks.threshold."
             )
-        drawn = [
-            self._foreground[rng.integers(0, len(self._foreground), in_foreground)],
-            self._background(rng.integers(0, background_size, in_background)),
-        ]
-        if on_boundary > 0:
-            drawn.append(self._boundary[rng.integers(0, len(self._boundary), on_boundary)])
-        return np.stack(np.unravel_index(np.concatenate(drawn), self.masks.shape), axis=1)
+        inside, rim = _drawn_from(self._object, in_foreground, outline_density, rng)
+        far = self._background(rng.integers(0, background_size, in_background))
+        beside, touching = _drawn_from(self._boundary, on_boundary, outline_density, rng)
+        flat = np.concatenate([inside, far, beside, rim, touching])
+        return np.stack(np.unravel_index(flat, self.masks.shape), axis=1), len(rim) + len(touching)
 
     def at(self, indices: Int[np.ndarray, "count 3"]) -> dict[str, np.ndarray]:
         """The given pixels (frame, line, sample).
@@ -182,9 +192,16 @@ class PixelSampler:
         return beside_foreground(self.masks, 1)
 
     @cached_property
-    def _boundary(self) -> Int[np.ndarray, "count"]:
-        """Background pixels within ``BOUNDARY_PX`` of the foreground (flat indices)."""
-        return np.flatnonzero(beside_foreground(self.masks, BOUNDARY_PX))
+    def _object(self) -> tuple[Int[np.ndarray, "count"], Int[np.ndarray, "count"]]:
+        """Foreground pixels inside the outline, and those on it (flat indices)."""
+        rim = self.masks & np.stack([dilate(~mask, 3) for mask in self.masks])
+        return np.flatnonzero(self.masks & ~rim), np.flatnonzero(rim)
+
+    @cached_property
+    def _boundary(self) -> tuple[Int[np.ndarray, "count"], Int[np.ndarray, "count"]]:
+        """Background pixels within ``BOUNDARY_PX`` of the foreground: off and on the outline (flat indices)."""
+        near = beside_foreground(self.masks, BOUNDARY_PX)
+        return np.flatnonzero(near & ~self._partly_covered), np.flatnonzero(self._partly_covered)
 
     @property
     def _background_size(self) -> int:
@@ -202,6 +219,16 @@ class PixelSampler:
         if self._drawn_background is not None:
             return self._drawn_background[ranks]
         return ranks + np.searchsorted(self._background_before, ranks, side="right")
+
+
+def _drawn_from(
+    parts: tuple[Int[np.ndarray, "a"], Int[np.ndarray, "b"]], count: int, density: float, rng: np.random.Generator
+) -> list[Int[np.ndarray, "drawn"]]:
+    """Random pixels off and on the outline, ``count`` in all; those on it are drawn ``density`` as often."""
+    off, on = map(len, parts)
+    on_outline = round(density * count * on / max(off + on, 1)) if off > 0 else count
+    drawn = zip(parts, (count - on_outline, on_outline), strict=True)
+    return [part[rng.integers(0, max(len(part), 1), number)] for part, number in drawn]
 
 
 def beside_foreground(

@@ -6,12 +6,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt
 
 from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, unpack, write_packed_cube
-from hsi_sc_nerf.packed.pixels import BOUNDARY_PX, PARTLY_FREE, PixelReader, PixelSampler, spread_over
+from hsi_sc_nerf.packed.pixels import (
+    BOUNDARY_PX,
+    PARTLY_FREE,
+    PixelReader,
+    PixelSampler,
+    beside_foreground,
+    spread_over,
+)
 
 SHAPE = (5, 7, 4)
 INDICES = np.array([[2, 4, 6], [0, 0, 0], [2, 1, 3], [1, 2, 2], [0, 4, 0]])
@@ -132,12 +139,12 @@ def test_a_fraction_of_the_background_lies_on_the_boundary(tmp_path):
     frame, line, sample = pixels.sample(0, foreground_ray_fraction=0.5, boundary_ray_fraction=0.75)["indices"].T
     distances = from_object[frame, line, sample]
     assert (distances == 0).sum() == 2000
-    boundary, rest = distances[2500:], distances[2000:2500]
-    assert boundary.min() >= 1.0
-    assert boundary.max() < BOUNDARY_PX + 1.0
-    assert rest.max() > 10.0
+    near, rest = (distances > 0) & (distances < BOUNDARY_PX + 1.0), distances >= BOUNDARY_PX + 1.0
+    assert 1500 <= near.sum() < 1700
+    assert near.sum() + rest.sum() == 2000
+    assert distances.max() > 10.0
     # Every pixel within the boundary's width.
-    drawn = np.unique(np.stack([frame, line, sample])[:, 2500:], axis=1).shape[1]
+    drawn = np.unique(np.stack([frame, line, sample])[:, near], axis=1).shape[1]
     assert drawn >= ((from_object > 0) & (from_object <= BOUNDARY_PX)).sum()
 
 
@@ -177,10 +184,37 @@ def test_a_restricted_background_is_drawn_from_alone(sampler, masks):
     pixels[:, 1:3] = True
     pixel_sampler = sampler(64)
     pixel_sampler.restrict_background(pixels)
-    drawn = np.concatenate([pixel_sampler.draw(step, 0.25) for step in range(20)])
+    drawn = np.concatenate([pixel_sampler.draw(step, 0.25)[0] for step in range(20)])
     background = drawn[~masks[tuple(drawn.T)]]
-    assert pixels[tuple(background.T)].all()
-    assert len(np.unique(background, axis=0)) == (pixels & ~masks).sum()
+    drawn_from = pixels & ~masks & ~beside_foreground(masks, 1)
+    assert drawn_from[tuple(background.T)].all()
+    assert len(np.unique(background, axis=0)) == drawn_from.sum()
+
+
+@pytest.mark.parametrize("density", [1.0, 0.5])
+def test_the_last_pixels_are_those_on_the_outline_as_many_in_every_step(tmp_path, density):
+    masks = np.zeros((2, 20, 30), bool)
+    masks[0, 5:15, 10:22] = masks[1, 2:9, 3:9] = True
+    counts = np.zeros((*masks.shape, 4), np.uint16)
+    pixels = PixelSampler(reader_of(tmp_path, counts), masks, 4000, 0, has_flagged=False)
+    pixels.restrict_background(np.ones_like(masks))
+    inside = np.stack([binary_erosion(mask) for mask in masks])
+    outside = np.stack([binary_dilation(mask) for mask in masks])
+    batches = [pixels.draw(step, 0.6, 0.5, density) for step in range(3)]
+    assert len({on_outline for _, on_outline in batches}) == 1
+    for drawn, on_outline in batches:
+        outline = drawn[-on_outline:]
+        assert ((outside & ~inside)[tuple(outline.T)]).all()
+        assert not ((outside & ~inside)[tuple(drawn[:-on_outline].T)]).any()
+        of_object = masks[tuple(drawn.T)]
+        assert of_object.sum() == 2400
+        rim = masks[tuple(outline.T)].sum()
+        assert rim == pytest.approx(2400 * density * (masks & ~inside).sum() / masks.sum(), abs=1)
+    everywhere = np.concatenate([pixels.draw(step, 0.6, 0.5, density)[0] for step in range(20)])
+    seen = np.zeros_like(masks)
+    seen[tuple(everywhere.T)] = True
+    assert (seen | ~(outside & ~inside)).all()
+    assert pixels.draw(0)[1] == 0
 
 
 def test_fixed_pixels_are_spread_over_the_object(masks):

@@ -1,0 +1,85 @@
+"""Rays through pixels: one through the centre, or four through the quarters of a pixel on the object's outline.
+
+Such a pixel shows the object and what is behind it, each by the area that it covers. One ray sees either.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Int
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.scene_box import OrientedBox
+from torch import Tensor
+
+QUARTERS = 4
+"""Rays through a pixel that is supersampled."""
+_OFFSETS_PX = ((-0.25, -0.25), (-0.25, 0.25), (0.25, -0.25), (0.25, 0.25))
+"""Centres of the quarters (line, sample) beside the pixel's."""
+
+
+class CameraRays:
+    """Rays from a table; those through pixel centres equal nerfstudio's `RayGenerator`'s.
+
+    All frames are of one camera: its rays are computed once and rotated by each frame's pose. nerfstudio takes away
+    the lens distortion of every batch anew, in a thousand small operations.
+
+    Args:
+        cameras: cameras of the frames, on the device.
+    """
+
+    def __init__(self, cameras: Cameras) -> None:
+        self._poses = cameras.camera_to_worlds.clone()
+        self._metadata = {key: value.clone() for key, value in (cameras.metadata or {}).items()}
+        to_camera = self._poses[0, :, :3]  # R^T d
+        self._centres = _table(cameras.generate_rays(camera_indices=0), to_camera)
+        lines, samples = self._centres[0].shape[:2]
+        pixels = torch.cartesian_prod(torch.arange(lines), torch.arange(samples)).view(lines, samples, 2)
+        self._quarters = _table(rays_through_quarters(cameras, pixels), to_camera)
+
+    def __call__(self, pixels: Int[Tensor, "count 3"], quartered: int = 0) -> RayBundle:
+        """Rays of pixels (frame, line, sample).
+
+        Args:
+            pixels: the pixels.
+            quartered: how many of them, the last, have `QUARTERS` rays each, one after the other.
+        """
+        frame, line, sample = pixels.unbind(dim=-1)
+        first = len(pixels) - quartered
+        in_camera, areas, norms = (
+            torch.cat([one[line[:first], sample[:first]], four[line[first:], sample[first:]].flatten(0, 1)])
+            for one, four in zip(self._centres, self._quarters, strict=True)
+        )
+        frame = torch.cat([frame[:first], frame[first:, None].expand(-1, QUARTERS).flatten()])
+        poses = self._poses[frame]
+        # A sum, because a GPU may compute a matrix product with fewer digits.
+        directions = (poses[:, :, :3] * in_camera[:, None]).sum(dim=-1)
+        metadata = {key: value[frame] for key, value in self._metadata.items()}
+        return RayBundle(
+            origins=poses[:, :, 3],
+            directions=directions,
+            pixel_area=areas,
+            camera_indices=frame[:, None],
+            metadata={"directions_norm": norms, **metadata},
+        )
+
+
+def rays_through_quarters(
+    cameras: Cameras, pixels: Int[Tensor, "*count 2"], obb_box: OrientedBox | None = None
+) -> RayBundle:
+    """Rays (*count, `QUARTERS`) of the first camera through the quarters of pixels (line, sample).
+
+    Args:
+        cameras: of the rays.
+        pixels: any number of them, in any shape.
+        obb_box: to which nerfstudio bounds the rays.
+    """
+    offsets_px = torch.tensor(_OFFSETS_PX, device=pixels.device)
+    coords = (pixels[..., None, :] + 0.5 + offsets_px).to(cameras.device)
+    return cameras.generate_rays(camera_indices=0, coords=coords, obb_box=obb_box)
+
+
+def _table(rays: RayBundle, to_camera: Tensor) -> list[Tensor]:
+    """Directions in the camera's frame, areas and norms of rays."""
+    assert rays.metadata is not None
+    return [rays.directions @ to_camera, rays.pixel_area, rays.metadata["directions_norm"]]
