@@ -56,11 +56,12 @@ def fit_marker(
     blur_px: float = 0.0,
     largest_shift_px: float = 2.0,
 ) -> FittedMarker | None:
-    """Least-squares fit of the marker's homography and of a linear shading to the image.
+    """Least-squares fit of the marker's homography and of its shading to the image.
 
     The image must be linear in reflectance: a gamma would move the half-way level of every edge. Gauss-Newton on
-    the 8 numbers of the homography (pixels to cells) with the shading (black and white level, each linear over the
-    marker) eliminated; pixels that do not fit are weighted down (Huber).
+    the 8 numbers of the homography (pixels to cells) with the shading eliminated: the black level is linear over the
+    marker, the contrast quadratic, because shade that bends over the marker would shift its edges. Pixels that do not
+    fit are weighted down (Huber).
 
     Args:
         dictionary: OpenCV's name of the marker's dictionary.
@@ -86,13 +87,14 @@ def fit_marker(
     texture = _texture(dictionary, marker, _texels_per_cell(corners_px, cells))
     unit_corners = _unit_square(cells).astype(float)
     corners = corners_px
-    shading = np.stack([np.ones(len(local)), local[:, 0], local[:, 1]], -1)
+    linear = np.stack([np.ones(len(local)), local[:, 0], local[:, 1]], -1)
+    quadratic = np.concatenate([linear, local**2, local[:, :1] * local[:, 1:]], -1)
     robust = np.ones(len(local))
     for _ in range(_ITERATIONS):
         rendered, by_homography = (part[inside] for part in _render(footprint, homography, texture))
-        design = np.concatenate([shading, shading * rendered[:, None]], -1)
+        design = np.concatenate([linear, quadratic * rendered[:, None]], -1)
         root = np.sqrt(robust)[:, None]
-        # Cholesky's factor of the 6 x 6 Gram matrix: as good as QR for these columns, and many times faster.
+        # Cholesky's factor of the 9 x 9 Gram matrix: as good as QR for these columns, and many times faster.
         gram = (root * design).T @ (root * design)
         try:
             back = np.linalg.inv(np.linalg.cholesky(gram)).T
@@ -103,7 +105,7 @@ def fit_marker(
         residual = weighted - basis @ (basis.T @ weighted)
         if residual @ residual > _HOPELESS_UNEXPLAINED * np.sum((weighted - weighted.mean()) ** 2):
             return None
-        white_over_black = shading @ (back @ (basis.T @ weighted))[3:]
+        white_over_black = quadratic @ (back @ (basis.T @ weighted))[3:]
         jacobian = root * white_over_black[:, None] * by_homography
         jacobian = jacobian - basis @ (basis.T @ jacobian)
         information = jacobian.T @ jacobian
@@ -122,7 +124,7 @@ def fit_marker(
         if np.abs(corners - previous).max() < _CONVERGED_PX:
             break
     # Quantised to 8 bit, no pixel is known better than 1/sqrt(12) of a level.
-    variance = max(float(residual @ residual) / max(len(local) - 14, 1), 1.0 / 12.0)
+    variance = max(float(residual @ residual) / max(len(local) - homography.size - back.shape[1], 1), 1.0 / 12.0)
     unexplained = float(np.sum(raw**2) / np.sum((values - values.mean()) ** 2))
     if unexplained > _LARGEST_UNEXPLAINED or white_over_black.min() <= 0.0:
         return None

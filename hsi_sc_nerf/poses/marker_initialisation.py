@@ -12,6 +12,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 from scipy.optimize import minimize_scalar
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.poses.bundle_adjustment import Problem
@@ -142,6 +144,17 @@ def _turned_over(turntable: Turntable) -> Turntable:
         angles_rad=-turntable.angles_rad,
         marker_poses=half_turn @ turntable.marker_poses,
     )
+
+
+def linked_rows(frame: Int[np.ndarray, "n"], marker: Int[np.ndarray, "n"]) -> np.ndarray:
+    """Mask of the rows in the largest set of frames that are linked by markers seen in two or more of them."""
+    frames, f = np.unique(frame, return_inverse=True)
+    markers, m = np.unique(marker, return_inverse=True)
+    size = len(frames) + len(markers)
+    links = coo_array((np.ones(len(f)), (f, m + len(frames))), shape=(size, size))
+    _, label = connected_components(links, directed=False)
+    counts = np.bincount(label[: len(frames)])
+    return label[f] == np.argmax(counts)
 
 
 def _marker_poses(corners_px, focal_px, centre_px, side_m):

@@ -9,6 +9,7 @@ motions of their own, the object, the table or the camera was displaced in them,
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -16,12 +17,11 @@ from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.stats import f as f_distribution
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters, Problem
+from hsi_sc_nerf.poses.marker_initialisation import linked_rows
 from hsi_sc_nerf.poses.residuals import MarkerResiduals
 from hsi_sc_nerf.poses.result import RejectedMarker
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, MarkerObservations, Turntable
@@ -42,6 +42,9 @@ LOSS_SIGMAS = 3.0
 EVIDENCE_NEEDED = 6.0
 """Least -log10 of the p-value of the simpler model. It is strict, because errors of neighbouring corners are not
 quite independent."""
+SYSTEMATIC_SIGMAS = 0.15
+"""Systematic errors of the corners, as by shade, resemble a distortion that explains this many standard deviations
+of each corner (docs/validation/poses.md)."""
 # A wobbling table's tilts (rad) and shifts (of the camera's distance) before their spread is known.
 _FIRST_SPREAD = (0.02, 0.01)
 _LEAST_SPREAD = (1e-5, 1e-6)
@@ -251,17 +254,6 @@ def frame_motions(
     return p_value, np.nan_to_num(errors_px[turntable.frames])
 
 
-def linked_rows(frame: Int[np.ndarray, "n"], marker: Int[np.ndarray, "n"]) -> np.ndarray:
-    """Mask of the rows in the largest set of frames that are linked by markers seen in two or more of them."""
-    frames, f = np.unique(frame, return_inverse=True)
-    markers, m = np.unique(marker, return_inverse=True)
-    size = len(frames) + len(markers)
-    links = coo_array((np.ones(len(f)), (f, m + len(frames))), shape=(size, size))
-    _, label = connected_components(links, directed=False)
-    counts = np.bincount(label[: len(frames)])
-    return label[f] == np.argmax(counts)
-
-
 def _solve(observations: MarkerObservations, turntable: Turntable, free: FreeParameters) -> Adjusted:
     problem = Problem(MarkerResiduals(turntable, observations, LOSS_SIGMAS), free=free)
     return Adjusted(problem.minimise(turntable), problem)
@@ -322,7 +314,7 @@ def _with_lens(plain: Adjusted, solve: _Solve) -> Adjusted:
     evidence = {**plain.evidence, "lens_distortion": 0.0}
     for terms in (1, 2):
         distorted = solve(plain.turntable, replace(plain.problem.free, radial_terms=terms))
-        found = _evidence(distorted, plain)
+        found = _evidence(distorted, plain, SYSTEMATIC_SIGMAS)
         evidence["lens_distortion"] = max(found, evidence["lens_distortion"])
         if found <= EVIDENCE_NEEDED:
             break
@@ -330,13 +322,17 @@ def _with_lens(plain: Adjusted, solve: _Solve) -> Adjusted:
     return replace(plain, evidence=evidence)
 
 
-def _evidence(more: Adjusted, less: Adjusted) -> float:
-    """F-test of nested models: -log10 of the probability under the simpler one."""
-    extra = more.problem.layout.size - less.problem.layout.size
-    if more.problem.numbers <= more.problem.layout.size:
+def _evidence(more: Adjusted, less: Adjusted, systematic: float = 0.0) -> float:
+    """F-test of nested models: -log10 of the probability under the simpler one.
+
+    Args:
+        systematic: of each number, the richer model may explain this many standard deviations without evidence.
+    """
+    extra, numbers = more.problem.layout.size - less.problem.layout.size, more.problem.numbers
+    if numbers <= more.problem.layout.size:
         return 0.0
-    ratio = (less.cost - more.cost) / extra / more.variance
-    return f_test_evidence(ratio, extra, more.degrees_of_freedom)
+    explained = math.sqrt(max(less.cost - more.cost, 0.0) / more.variance) - systematic * math.sqrt(numbers)
+    return f_test_evidence(max(explained, 0.0) ** 2 / extra, extra, more.degrees_of_freedom)
 
 
 def f_test_evidence(ratio: float, extra: int, degrees_of_freedom: int) -> float:
@@ -347,4 +343,4 @@ def f_test_evidence(ratio: float, extra: int, degrees_of_freedom: int) -> float:
         extra: number of these parameters.
         degrees_of_freedom: degrees of freedom of the residuals' variance.
     """
-    return float(-np.log10(max(f_distribution.sf(ratio, extra, degrees_of_freedom), _SMALLEST_P)))
+    return -math.log10(max(f_distribution.sf(ratio, extra, degrees_of_freedom), _SMALLEST_P)) + 0.0  # not -0.0

@@ -104,6 +104,24 @@ def test_training_does_not_see_flagged_values(pipeline):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("supersample", [True, False])
+def test_training_gives_outline_pixels_four_rays_and_draws_them_half_as_often(flagged_dataset, supersample):
+    config = pipeline_config(flagged_dataset)
+    config.model.supersample_outline = supersample
+    manager = config.setup(device="cpu").datamanager
+    manager.foreground_ray_fraction, manager.boundary_ray_fraction = 0.6, 0.5
+    rays, batch = manager.next_train(0)
+    fractions = (0, 0.6, 0.5)
+    _, on_outline = manager.train_pixel_sampler.draw(*fractions)
+    assert on_outline > 20
+    assert len(batch["indices"]) == 256
+    expected = 256 + 3 * round(on_outline / 2) if supersample else 256
+    assert len(rays) == pytest.approx(expected, abs=3 * supersample)
+    manager.foreground_ray_fraction = None  # whole frames
+    assert len(manager.next_train(0)[0]) == 256
+
+
+@pytest.mark.slow
 def test_held_out_views_are_judged_by_their_measurements(pipeline):
     _, batch = next(iter(pipeline.datamanager.fixed_indices_eval_dataloader))
     height, width, _ = batch["spectral"].shape

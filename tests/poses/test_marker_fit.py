@@ -90,6 +90,24 @@ def test_fit_does_not_mind_exposure_and_shading(small):
     np.testing.assert_allclose(fit_marker(shaded, DICTIONARY, marker, start).corners_px, here.corners_px, atol=0.03)
 
 
+def test_fit_does_not_mind_shade_that_bends_over_the_marker(small):
+    """As beside a container: a third of the light is lost at one edge. Linear shading shifts corners by up to 0.09."""
+    _, images = small
+    x = np.arange(images[0].shape[1]) + 0.5
+    shifts_px = []
+    for image in images:
+        for marker, start in detect_markers(image, DICTIONARY).items():
+            low, high = start[:, 0].min(), start[:, 0].max()
+            shade = 1.0 - 0.35 * np.clip((x - low) / (high - low), 0.0, 1.0) ** 2
+            here, shaded = (
+                fit_marker(one, DICTIONARY, marker, start) for one in (image.astype(float), image * shade)
+            )
+            if here is not None and shaded is not None:
+                shifts_px.append(np.abs(shaded.corners_px - here.corners_px).max())
+    assert len(shifts_px) >= 8
+    assert max(shifts_px) < 0.05
+
+
 def test_fit_refuses_another_marker_and_the_images_edge(small):
     _, images = small
     marker, start = next(iter(detect_markers(images[0], DICTIONARY).items()))

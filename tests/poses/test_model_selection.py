@@ -112,6 +112,15 @@ def test_lens_distortion_is_found(radial):
     assert (found.radial[1] == 0.0) == (radial[1] == 0.0)
 
 
+def test_a_distortion_that_shade_resembles_is_not_taken():
+    """Shade shifts all corners a little; the F-test alone would take it for a lens."""
+    machine = marker_turntable(MarkerScene(size_px=256, frames=18, fov_deg=35.0), radial=(-0.012, 0.0))
+    found = solved(machine, marker_observations(machine))
+    assert found.turntable.radial == (0.0, 0.0)
+    assert 0.0 <= found.evidence["lens_distortion"] < EVIDENCE_NEEDED
+    assert found.turntable.focal_px == pytest.approx(machine.focal_px, rel=2e-3)
+
+
 def test_displaced_markers_are_thrown_out():
     machine = marker_turntable(MarkerScene(size_px=256, frames=14))
     observations = marker_observations(machine)
