@@ -91,7 +91,7 @@ def test_fit_does_not_mind_exposure_and_shading(small):
 
 
 def test_fit_does_not_mind_shade_that_bends_over_the_marker(small):
-    """As beside a container: a third of the light is lost at one edge. Linear shading shifts corners by up to 0.09."""
+    """As beside a container: a third of the light is lost at one edge. Linear shading shifts corners by 0.09 px."""
     _, images = small
     x = np.arange(images[0].shape[1]) + 0.5
     shifts_px = []
