@@ -3,7 +3,8 @@
     uv run python benchmarks/pose_hard_cases.py
 
 Each case is a simulated session with one thing that makes it hard; errors are those against its true poses, over the
-used frames. benchmarks/poses_without_markers.py measures poses from features.
+used frames. "Size" is how much too large an object on the axis comes out, by distance and focal length together.
+benchmarks/poses_without_markers.py measures poses from features.
 """
 
 from __future__ import annotations
@@ -37,11 +38,14 @@ COLUMNS = (
     "rotation, deg",
     "position, mm",
     "focal, %",
+    "size, %",
     "reprojection, px",
     "time, s",
     "model; warnings",
 )
 WORKERS = 2
+OBJECT_HEIGHT_M = 0.12
+"""Height of the middle of the simulator's fruit."""
 Images = list[UInt8[np.ndarray, "h w"]]
 
 
@@ -115,6 +119,11 @@ CASES = {
     "no texture": Case(scene="sphere"),
     "lamp, gloss and shadows": Case(("lamp", "gloss", "chamber_shading")),
     "lens distortion (k1 -0.15)": Case(("lens_distortion",)),
+    "128 px": Case(("photon_noise",), frames=60, size=0.25),
+    "128 px, the chamber's shade": Case(("photon_noise", "chamber_shading"), frames=60, size=0.25),
+    "128 px, shade, k1 -0.03": Case(
+        ("photon_noise", "chamber_shading", "{lens_distortion: {k1: -0.03}}"), frames=60, size=0.25
+    ),
     "wobble of 0.3 degrees": Case(("wobble",), frames=36, any_axis=True),
     "wobble of 1 degree": Case(("{wobble: {amplitude_deg: 1}}",), frames=36, any_axis=True),
 }
@@ -130,6 +139,7 @@ class Posed:
         poses: of its frames.
         rotation_deg: errors of the used frames' rotations.
         position_mm: errors of the used frames' positions.
+        size_percent: how much too large an object on the axis, `OBJECT_HEIGHT_M` up, comes out.
         seconds: wall time.
     """
 
@@ -138,6 +148,7 @@ class Posed:
     poses: TurntablePoses
     rotation_deg: Float[np.ndarray, "n"]
     position_mm: Float[np.ndarray, "n"]
+    size_percent: float
     seconds: float
 
     @property
@@ -194,7 +205,11 @@ def pose(case: Case, size_px: int, frames: int | None = None) -> Posed:
         truth = aligned_poses(truth, found)
     if case.any_height:
         truth[:, 2, 3] += np.mean(found[:, 2, 3] - truth[:, 2, 3])
-    return Posed(simulation, info, poses, *pose_errors(found, truth), seconds)
+    middle = np.array([0.0, 0.0, OBJECT_HEIGHT_M])
+    distance, true_distance = (np.linalg.norm(of[:, :3, 3] - middle, axis=1).mean() for of in (found, truth))
+    magnified = poses.intrinsics.fl_x / simulation.intrinsics.fl_x
+    size_percent = 100.0 * (distance / true_distance / magnified - 1.0)
+    return Posed(simulation, info, poses, *pose_errors(found, truth), size_percent, seconds)
 
 
 def pose_errors(
@@ -261,6 +276,7 @@ def _cells(posed: Posed) -> tuple[str, ...]:
         f"{posed.rotation_deg.max():.3f}",
         f"{posed.position_mm.max():.2f}",
         f"{posed.focal_percent:+.3f}",
+        f"{posed.size_percent:+.3f}",
         f"{poses.overall_error_px:.3f}",
         f"{posed.seconds:.0f}",
         "; ".join([poses.model, *(f.sentence for f in check_poses(poses, posed.info) if f.level != "green")]),
