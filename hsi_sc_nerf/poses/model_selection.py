@@ -42,7 +42,7 @@ LOSS_SIGMAS = 3.0
 EVIDENCE_NEEDED = 6.0
 """Least -log10 of the p-value of the simpler model. It is strict, because errors of neighbouring corners are not
 quite independent."""
-SYSTEMATIC_SIGMAS = 0.06
+SYSTEMATIC_SIGMAS = 0.12
 """Systematic errors of the corners, as by shade, resemble a distortion that explains this many standard deviations
 of each corner (docs/validation/poses.md)."""
 # A wobbling table's tilts (rad) and shifts (of the camera's distance) before their spread is known.
