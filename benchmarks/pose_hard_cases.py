@@ -263,7 +263,7 @@ class PoseHardCases:
             try:
                 measured = _cells(pose(CASES[name], self.size))
             except InputError as error:
-                measured = ("0", "", "", "", "", "", f"refused: {error}")
+                measured = ("0", *[""] * (len(COLUMNS) - 3), f"refused: {error}")
             rows.append((name, *measured))
             print(" | ".join(rows[-1]), flush=True)
         write_results("pose_hard_cases", COLUMNS, rows, keys=1, folder=self.results)
