@@ -25,6 +25,11 @@ def dilate(mask: Bool[np.ndarray, "lines samples"], size_px: int) -> Bool[np.nda
     return cv2.dilate(mask.astype(np.uint8), ellipse) > 0
 
 
+def beside(mask: Bool[np.ndarray, "lines samples"], width_px: int) -> Bool[np.ndarray, "lines samples"]:
+    """Pixels outside the mask within about ``width_px`` of it; with 1, those that share a side with it."""
+    return dilate(mask, 2 * width_px + 1) & ~mask
+
+
 def touching(
     mask: Bool[np.ndarray, "lines samples"], other: Bool[np.ndarray, "lines samples"], min_area_px: int = 1
 ) -> Bool[np.ndarray, "lines samples"]:

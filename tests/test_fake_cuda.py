@@ -93,7 +93,7 @@ def on_gpu(request, flagged_dataset):
     manager = pipeline.datamanager
     frames, masks = manager.train_dataset.frames, manager.train_pixel_sampler.masks
     pixels = DevicePixels(frames, masks, "cpu", has_flagged=True)
-    rays = CameraRays(manager.train_dataset.cameras)
+    rays = CameraRays(manager.train_dataset.cameras, quarters=True)
     mode = FakeTensorMode()
     move_module(pipeline.model, mode)
     collider = pipeline.model.collider

@@ -26,16 +26,18 @@ class CameraRays:
 
     Args:
         cameras: cameras of the frames, on the device.
+        quarters: whether rays through quarters are asked for.
     """
 
-    def __init__(self, cameras: Cameras) -> None:
+    def __init__(self, cameras: Cameras, *, quarters: bool = False) -> None:
         self._poses = cameras.camera_to_worlds.clone()
         self._metadata = {key: value.clone() for key, value in (cameras.metadata or {}).items()}
         to_camera = self._poses[0, :, :3]  # R^T d
         self._centres = _table(cameras.generate_rays(camera_indices=0), to_camera)
-        lines, samples = self._centres[0].shape[:2]
-        pixels = torch.cartesian_prod(torch.arange(lines), torch.arange(samples)).view(lines, samples, 2)
-        self._quarters = _table(rays_through_quarters(cameras, pixels), to_camera)
+        if quarters:
+            lines, samples = self._centres[0].shape[:2]
+            pixels = torch.cartesian_prod(torch.arange(lines), torch.arange(samples)).view(lines, samples, 2)
+            self._quarters = _table(rays_through_quarters(cameras, pixels), to_camera)
 
     def __call__(self, pixels: Int[Tensor, "count 3"], quartered: int = 0) -> RayBundle:
         """Rays of pixels (frame, line, sample).
@@ -46,11 +48,12 @@ class CameraRays:
         """
         frame, line, sample = pixels.unbind(dim=-1)
         first = len(pixels) - quartered
-        in_camera, areas, norms = (
-            torch.cat([one[line[:first], sample[:first]], four[line[first:], sample[first:]].flatten(0, 1)])
-            for one, four in zip(self._centres, self._quarters, strict=True)
-        )
-        frame = torch.cat([frame[:first], frame[first:, None].expand(-1, QUARTERS).flatten()])
+        found = [table[line[:first], sample[:first]] for table in self._centres]
+        if quartered > 0:
+            four = (table[line[first:], sample[first:]].flatten(0, 1) for table in self._quarters)
+            found = [torch.cat(both) for both in zip(found, four, strict=True)]
+            frame = torch.cat([frame[:first], frame[first:, None].expand(-1, QUARTERS).flatten()])
+        in_camera, areas, norms = found
         poses = self._poses[frame]
         # A sum, because a GPU may compute a matrix product with fewer digits.
         directions = (poses[:, :, :3] * in_camera[:, None]).sum(dim=-1)

@@ -13,9 +13,10 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from hsi_sc_nerf.morphology import beside
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE
 from hsi_sc_nerf.packed.dataset import PackedFrame
-from hsi_sc_nerf.packed.pixels import PARTLY_FREE, beside_foreground
+from hsi_sc_nerf.packed.pixels import PARTLY_FREE
 
 MAX_MEMORY_FRACTION = 0.5
 """Cubes are kept on a GPU if they fill at most this fraction of its free memory."""
@@ -49,7 +50,7 @@ class DevicePixels:
     ) -> None:
         self.has_flagged = has_flagged
         self._masks = torch.from_numpy(masks).to(device)
-        self._partly_covered = torch.from_numpy(beside_foreground(masks, 1)).to(device)
+        self._partly_covered = torch.from_numpy(np.stack([beside(mask, 1) for mask in masks])).to(device)
         # PyTorch supports few operations on unsigned 16-bit integers; int16 holds the same bits.
         self._counts = torch.empty((*masks.shape, frames[0].cube().shape[2]), dtype=torch.int16, device=device)
         for held, frame in zip(self._counts, frames, strict=True):

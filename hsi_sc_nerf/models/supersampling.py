@@ -17,7 +17,7 @@ from nerfstudio.data.scene_box import OrientedBox
 from torch import Tensor
 
 from hsi_sc_nerf.data.camera_rays import QUARTERS, rays_through_quarters
-from hsi_sc_nerf.morphology import dilate
+from hsi_sc_nerf.morphology import beside
 
 _HALF = 0.5
 """Opacity above which a pixel shows the scene."""
@@ -84,4 +84,4 @@ def _quartered(rays: int, pixels: int) -> int:
 def outline_pixels(shown: Bool[Tensor, "lines samples"]) -> Int[Tensor, "n 2"]:
     """Pixels (line, sample) that show the object beside others that do not, and the other way round."""
     mask = shown.numpy(force=True)
-    return torch.from_numpy(np.argwhere(np.where(mask, dilate(~mask, 3), dilate(mask, 3))))
+    return torch.from_numpy(np.argwhere(beside(mask, 1) | beside(~mask, 1)))

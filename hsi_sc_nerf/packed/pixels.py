@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Int, UInt16
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.morphology import dilate
+from hsi_sc_nerf.morphology import beside
 from hsi_sc_nerf.packed.cube import unpack, unpack_unflagged
 
 BOUNDARY_PX = 3
@@ -189,18 +189,18 @@ class PixelSampler:
     @cached_property
     def _partly_covered(self) -> Bool[np.ndarray, "frames lines samples"]:
         """Background pixels of which the object may cover a part."""
-        return beside_foreground(self.masks, 1)
+        return np.stack([beside(mask, 1) for mask in self.masks])
 
     @cached_property
     def _object(self) -> tuple[Int[np.ndarray, "count"], Int[np.ndarray, "count"]]:
         """Foreground pixels inside the outline, and those on it (flat indices)."""
-        rim = self.masks & np.stack([dilate(~mask, 3) for mask in self.masks])
+        rim = np.stack([beside(~mask, 1) for mask in self.masks])
         return np.flatnonzero(self.masks & ~rim), np.flatnonzero(rim)
 
     @cached_property
     def _boundary(self) -> tuple[Int[np.ndarray, "count"], Int[np.ndarray, "count"]]:
         """Background pixels within ``BOUNDARY_PX`` of the foreground: off and on the outline (flat indices)."""
-        near = beside_foreground(self.masks, BOUNDARY_PX)
+        near = np.stack([beside(mask, BOUNDARY_PX) for mask in self.masks])
         return np.flatnonzero(near & ~self._partly_covered), np.flatnonzero(self._partly_covered)
 
     @property
@@ -229,13 +229,6 @@ def _drawn_from(
     on_outline = round(density * count * on / max(off + on, 1)) if off > 0 else count
     drawn = zip(parts, (count - on_outline, on_outline), strict=True)
     return [part[rng.integers(0, max(len(part), 1), number)] for part, number in drawn]
-
-
-def beside_foreground(
-    masks: Bool[np.ndarray, "frames lines samples"], width_px: int
-) -> Bool[np.ndarray, "frames lines samples"]:
-    """Background pixels within ``width_px`` of the foreground; with 1, those that share a side with it."""
-    return np.stack([dilate(mask, 2 * width_px + 1) & ~mask for mask in masks])
 
 
 def spread_over(masks: Bool[np.ndarray, "frames lines samples"], count: int) -> Int[np.ndarray, "at_most_count 3"]:

@@ -10,13 +10,13 @@ from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_ed
 
 from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.morphology import beside
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, unpack, write_packed_cube
 from hsi_sc_nerf.packed.pixels import (
     BOUNDARY_PX,
     PARTLY_FREE,
     PixelReader,
     PixelSampler,
-    beside_foreground,
     spread_over,
 )
 
@@ -186,7 +186,7 @@ def test_a_restricted_background_is_drawn_from_alone(sampler, masks):
     pixel_sampler.restrict_background(pixels)
     drawn = np.concatenate([pixel_sampler.draw(step, 0.25)[0] for step in range(20)])
     background = drawn[~masks[tuple(drawn.T)]]
-    drawn_from = pixels & ~masks & ~beside_foreground(masks, 1)
+    drawn_from = pixels & ~masks & ~np.stack([beside(mask, 1) for mask in masks])
     assert drawn_from[tuple(background.T)].all()
     assert len(np.unique(background, axis=0)) == drawn_from.sum()
 
