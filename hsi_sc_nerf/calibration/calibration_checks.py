@@ -309,7 +309,9 @@ def _check_noise(session: Session, calibration: SessionCalibration) -> Finding:
         )
         return Finding("noise", "amber", f"{session.path}: {sentence}", values)
     if not (noise.read_noise_measured and noise.photon_noise_measured):
-        what = "read noise" if noise.photon_noise_measured else "photon noise"
-        sentence = f"the {what} was not measured; add dark cubes of several lines and a white that fills the image."
-        return Finding("noise", "amber", f"{session.path}: {sentence}", values)
+        unknown = {"read noise": noise.read_noise_measured, "photon noise": noise.photon_noise_measured}
+        what = " and the ".join(name for name, measured in unknown.items() if not measured)
+        sentence = f"the {what} was not measured, so no uncertainty is stated and the spectra tell the noise"
+        advice = "a white that fills the image, or dark cubes of several lines, would tell it"
+        return Finding("noise", "amber", f"{session.path}: {sentence}; {advice}.", values)
     return Finding("noise", "green", f"Noise: {text}.", values)

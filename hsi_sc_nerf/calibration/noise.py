@@ -1,8 +1,8 @@
 """Noise of a reading, from the session's dark and white cubes, and the uncertainty of reflectance that follows.
 
 The variance of a reading is linear in its counts above dark, the photon transfer curve (Janesick, "Photon Transfer",
-SPIE 2007): ``variance = read_noise^2 + counts_per_electron * counts``. The dark cube gives the read noise, the white
-the slope.
+SPIE 2007): ``variance = read_noise^2 + counts_per_electron * counts``. The white gives the slope. A dark cube of
+several lines gives the read noise; a SPECIM IQ's has one, and the white's dim bands tell it instead.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, Num
 from scipy import stats
+from scipy.optimize import nnls
 
 from hsi_sc_nerf.calibration.detector import dark_columns
 from hsi_sc_nerf.packed.cube import ReflectanceUncertainty
@@ -24,6 +25,10 @@ MIN_PIXELS = 100
 """Fewest pixels of the white that the slope is measured on."""
 MAX_SATURATED = 0.01
 """A band is not used for the slope if a larger fraction of its elements saturates on the white."""
+DIM = 0.1
+"""Brightness, relative to the white, of the readings whose noise must be known."""
+MAX_VARIANCE_ERROR = 0.25
+"""A read noise is taken from the white if this is its largest error, relative to the variance of dim readings."""
 OUTLIER_PROBABILITY = 1e-4
 """Pixels and elements that noise alone would make more rarely than this are dirt or defects, and are left out."""
 
@@ -36,7 +41,7 @@ class NoiseModel:
         read_noise: standard deviation of a reading without light, counts, including rounding.
         counts_per_electron: slope of the photon transfer curve, the variance for each count above dark; the same for
             all elements.
-        read_noise_measured: False if there is no usable dark cube and ``read_noise`` is that of rounding alone.
+        read_noise_measured: False if neither dark nor white tell it and ``read_noise`` is that of rounding alone.
         photon_noise_measured: False if the white is not usable and the slope is 0.
     """
 
@@ -70,9 +75,17 @@ def measure_noise(
     bands = white.shape[2]
     rounding = np.full(bands, np.sqrt(QUANTISATION_VARIANCE))
     measured = None if dark is None else read_noise(dark, None if dark.shape[1] != white.shape[1] else dead)
-    deviation = rounding if measured is None else np.maximum(measured, rounding)
     level = dark_columns(dark, *white.shape[1:])
-    slope = photon_transfer_slope(white, region, level, deviation, saturation_counts=saturation_counts, dead=dead)
+    # Without the dark level, the white's counts do not tell how many of them are photons.
+    known = rounding if dark is None else measured
+    transfer = photon_transfer(white, region, level, known, saturation_counts=saturation_counts, dead=dead)
+    if transfer is None:
+        slope = None
+    else:
+        slope, of_white = transfer
+        if measured is None and of_white is not None:
+            measured = np.full(bands, of_white)
+    deviation = rounding if measured is None else np.maximum(measured, rounding)
     return NoiseModel(deviation, slope or 0.0, measured is not None, slope is not None)
 
 
@@ -143,21 +156,22 @@ def read_noise(
     return np.sqrt(np.where(usual, variance, 0.0).sum(axis=0) / np.maximum(usual.sum(axis=0), 1))
 
 
-def photon_transfer_slope(
+def photon_transfer(
     white: Num[np.ndarray, "lines samples bands"],
     region: Bool[np.ndarray, "lines samples"],
     dark: Float[np.ndarray, "columns bands"],
-    read_noise: Float[np.ndarray, "bands"],
+    read_noise: Float[np.ndarray, "bands"] | None = None,
     *,
     saturation_counts: float | None = None,
     dead: Bool[np.ndarray, "samples bands"] | None = None,
-) -> float | None:
-    """Slope of the photon transfer curve, counts per electron, from the white.
+) -> tuple[float, float | None] | None:
+    """Slope of the photon transfer curve, counts per electron, from the white; the read noise if it is not known.
 
     Second differences between three neighbouring lines cancel constants and gradients over the white; their variance
     is 6 times that of a reading. In each pixel the difference's component along the white's spectrum (a weave, a
     flickering lamp) is projected out, and pixels that are still outliers (dirt, edges) are left out. The slope is the
-    weighted least-squares fit over the bands, whose signals differ, with the read noise as intercept.
+    weighted least-squares fit over the bands, whose signals differ, with the read noise as intercept. An intercept
+    that the bands hardly determine is None.
 
     Returns None if the region is too small or nothing in it is lit and unsaturated.
     """
@@ -190,7 +204,7 @@ def photon_transfer_slope(
     squared /= 6.0
     kept = inside & _inliers(squared, inside, readable)
     # Expected squares after the projection: per_slope * slope + of_read.
-    read_variance = readable * read_noise**2
+    read_variance = readable * (1.0 if read_noise is None else read_noise**2)
     per_slope = signal * (1.0 - fraction)
     of_read = read_variance * (1.0 - 2.0 * fraction) + fraction**2 * read_variance.sum(axis=1, keepdims=True)
     readings = kept.sum(axis=0) @ readable.astype(float)
@@ -200,12 +214,31 @@ def photon_transfer_slope(
     if not x.any():
         # The projection leaves nothing of a single band.
         return None
-    slope = 0.0
+    if read_noise is None:
+        (slope, variance), (_, error) = _fit_variances(np.stack([x, offset], axis=1), y, 0.0 * y, readings[used])
+        if error <= MAX_VARIANCE_ERROR * (max(variance, QUANTISATION_VARIANCE) + slope * DIM * x.min()):
+            return float(slope), float(np.sqrt(variance))
+        offset = QUANTISATION_VARIANCE * offset
+    (slope,), _ = _fit_variances(x[:, None], y, offset, readings[used])
+    return float(slope), None
+
+
+def _fit_variances(
+    design: Float[np.ndarray, "n k"],
+    measured: Float[np.ndarray, "n"],
+    offset: Float[np.ndarray, "n"],
+    readings: Float[np.ndarray, "n"],
+) -> tuple[Float[np.ndarray, "k"], Float[np.ndarray, "k"]]:
+    """Weighted least squares ``measured = offset + design @ x`` with x >= 0; x and its standard errors."""
+    found = np.zeros(design.shape[1])
+    scale = np.abs(design).max(axis=0).clip(min=1e-300)
     for _ in range(5):
-        # The error of a variance is proportional to it, so the weights depend on the slope.
-        weight = readings[used] / np.maximum(offset + slope * x, QUANTISATION_VARIANCE) ** 2
-        slope = max(0.0, float((weight * x * (y - offset)).sum() / (weight * x * x).sum()))
-    return slope
+        # The error of a variance is proportional to it, so the weights depend on what is fitted.
+        weight = np.sqrt(readings) / np.maximum(offset + design @ found, QUANTISATION_VARIANCE)
+        weighted = weight[:, None] * design / scale
+        found = nnls(weighted, weight * (measured - offset))[0] / scale
+    # Variance of a squared deviation: twice the square of its mean.
+    return found, np.sqrt(2.0 * np.diag(np.linalg.pinv(weighted.T @ weighted))) / scale
 
 
 def _inliers(

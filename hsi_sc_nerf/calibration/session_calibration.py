@@ -90,7 +90,8 @@ class SessionCalibration:
         defects: defects of the detector; None for "product".
         noise: noise of a reading; None for "product".
         drift_corrected: whether the frames are divided by it.
-        uncertainty: uncertainty of reflectance in the kept bands; None for "product".
+        uncertainty: uncertainty of reflectance in the kept bands; None for "product", and where the noise
+            of a reading could not be measured.
     """
 
     source: WhiteSource
@@ -320,7 +321,9 @@ def _uncertainty(
     noise: NoiseModel,
     panel: Float[np.ndarray, "bands"],
     kept: Int[np.ndarray, "kept"],
-) -> ReflectanceUncertainty:
+) -> ReflectanceUncertainty | None:
+    if not (noise.read_noise_measured and noise.photon_noise_measured):
+        return None
     capture, dark = session.frames[0], white_cubes(session, source)[1]
     spectrum = white.mean_spectrum()
     # Bad bands take no part in their neighbours' average, so any finite number will do.

@@ -108,7 +108,8 @@ class PackedDataset:
         flagged_values: number of values that are ``FLAGGED``, in all cubes.
         bad_bands_nm: centres of the bands that were left out because they measure nothing.
         fwhm_nm: full widths at half maximum of the bands; None if they are unknown.
-        uncertainty: uncertainty of the reflectance; None if it is unknown (finished reflectance).
+        uncertainty: uncertainty of the reflectance; None if it is unknown (finished reflectance, or noise
+            that could not be measured).
         typical_uncertainty: standard deviation by band at the object's mean reflectance; None likewise.
         pose_method: how the poses were estimated ("markers", "colmap", "angles"); None if that is unknown.
         fingerprint: fingerprint of the session and the settings that the dataset was made from.

@@ -9,7 +9,7 @@ from hsi_sc_nerf.calibration.noise import (
     QUANTISATION_VARIANCE,
     NoiseModel,
     measure_noise,
-    photon_transfer_slope,
+    photon_transfer,
     read_noise,
     reflectance_uncertainty,
 )
@@ -86,14 +86,32 @@ def test_flickering_elements_do_not_count_for_the_read_noise():
     np.testing.assert_allclose(read_noise(dark), np.hypot(READ_NOISE, np.sqrt(QUANTISATION_VARIANCE)), rtol=0.05)
 
 
-@pytest.mark.parametrize("dark", [None, np.full((1, SAMPLES, BANDS), 100), np.full((64, SAMPLES, BANDS), 100)])
-def test_rounding_is_all_that_is_sure_of_a_dark_without_noise(dark):
-    white, _ = exposures(read=0.0)
-    noise = measure_noise(white, REGION, dark)
+@pytest.mark.parametrize("dark_lines", [1, 64])
+@pytest.mark.parametrize("read", [0.0, READ_NOISE, 12.0])
+def test_the_white_tells_the_read_noise_where_the_dark_does_not(dark_lines, read):
+    white, _ = exposures(weave(), read=read)
+    noise = measure_noise(white, REGION, np.full((dark_lines, SAMPLES, BANDS), 100))
+    assert noise.read_noise_measured
+    assert noise.counts_per_electron == pytest.approx(COUNTS_PER_ELECTRON, rel=0.03)
+    np.testing.assert_allclose(noise.read_noise, np.hypot(read, np.sqrt(QUANTISATION_VARIANCE)), rtol=0.1, atol=0.4)
+
+
+def test_a_white_as_bright_in_all_bands_does_not_tell_it():
+    rng = np.random.default_rng(8)
+    white = digitised(np.full((LINES, SAMPLES, BANDS), 2000.0), rng)
+    noise = measure_noise(white, REGION, np.full((1, SAMPLES, BANDS), 100))
     assert not noise.read_noise_measured
     np.testing.assert_array_equal(noise.read_noise, np.sqrt(QUANTISATION_VARIANCE))
-    if dark is not None:
-        assert noise.counts_per_electron == pytest.approx(COUNTS_PER_ELECTRON, rel=0.03)
+    # What it cannot tell apart counts as photon noise.
+    whole = COUNTS_PER_ELECTRON + READ_NOISE**2 / 2000.0
+    assert noise.counts_per_electron == pytest.approx(whole, rel=0.03)
+
+
+def test_without_a_dark_level_rounding_is_all_that_is_sure():
+    white, _ = exposures()
+    noise = measure_noise(white, REGION, None)
+    assert not noise.read_noise_measured
+    np.testing.assert_array_equal(noise.read_noise, np.sqrt(QUANTISATION_VARIANCE))
 
 
 def test_no_photon_noise_gives_slope_zero():
@@ -106,9 +124,9 @@ def test_no_photon_noise_gives_slope_zero():
 def test_a_tarp_that_tells_nothing():
     white, dark = exposures()
     level = dark.mean(axis=0)
-    assert photon_transfer_slope(white, np.zeros_like(REGION), level, np.ones(BANDS)) is None
+    assert photon_transfer(white, np.zeros_like(REGION), level, np.ones(BANDS)) is None
     full = np.full_like(white, 4095)
-    assert photon_transfer_slope(full, REGION, level, np.ones(BANDS), saturation_counts=4095) is None
+    assert photon_transfer(full, REGION, level, np.ones(BANDS), saturation_counts=4095) is None
     noise = measure_noise(full, REGION, dark, saturation_counts=4095)
     assert noise.counts_per_electron == 0.0
     assert not noise.photon_noise_measured

@@ -136,6 +136,44 @@ def test_no_data_is_taken_neither_for_light_nor_for_darkness(tmp_path, gap, dtyp
     np.testing.assert_allclose(gappy.drift.factor, whole.drift.factor, atol=1e-3)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("white_lines", [None, 2])
+def test_a_dark_of_one_line_states_the_uncertainty_of_many_or_none(tmp_path, white_lines):
+    scene = override(load_scene("pear"), size_px=72, bands=24, frames=3, effects=NOISE)
+    session = open_session(simulate_session(scene, tmp_path / "session", progress=False))
+    whole = calibrate_session(session, CalibrationConfig())
+    for dark in {capture.dark for capture in session.captures}:
+        keep_lines(dark, slice(1))
+    if white_lines is not None:
+        x0, y0, x1, _ = whole.white.roi
+        keep_lines(session.white.cube, slice(y0, y0 + white_lines))
+        roi = (x0, 0, x1, white_lines)
+    single = calibrate_session(
+        open_session(session.path), CalibrationConfig(roi=None if white_lines is None else roi)
+    )
+    if white_lines is not None:
+        assert single.uncertainty is None
+        return
+    np.testing.assert_allclose(single.noise.read_noise, whole.noise.read_noise, rtol=0.1)
+    grey = np.full(len(whole.bands), 0.1)
+    # One reading of the dark is subtracted instead of the mean of many.
+    assert (single.uncertainty.constant > 1.5 * whole.uncertainty.constant).all()
+    ratio = single.uncertainty.standard_deviation(grey) / whole.uncertainty.standard_deviation(grey)
+    assert ((ratio > 0.95) & (ratio < 1.5)).all()
+
+
+def keep_lines(cube: Cube, lines: slice) -> None:
+    """Write a cube again with some of its lines."""
+    write_cube(
+        cube.header_path,
+        cube.read()[lines],
+        wavelengths_nm=cube.wavelengths_nm,
+        interleave=cube.interleave,
+        data_suffix=cube.data_path.suffix,
+        extra_header={"tint": cube.integration_time_ms},
+    )
+
+
 def test_hot_elements_do_not_move_the_tarp(tmp_path):
     session = write_session(tmp_path)
     tarp = np.full((SIZE_PX, SIZE_PX, BANDS), 0.05)
