@@ -108,23 +108,57 @@ class _CompiledAngle(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, a: Tensor, b: Tensor) -> Tensor:
-        from hsi_sc_nerf import spectral_angle_cpu  # compiles; a GPU does without it
+        from hsi_sc_nerf import spectral_losses_cpu  # compiles; a GPU does without it
 
         ctx.save_for_backward(a, b)
-        return torch.from_numpy(spectral_angle_cpu.angles(a.numpy(force=True), b.numpy(force=True)))
+        return torch.from_numpy(spectral_losses_cpu.angles(a.numpy(force=True), b.numpy(force=True)))
 
     @staticmethod
     @once_differentiable
     def backward(ctx, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        from hsi_sc_nerf import spectral_angle_cpu
+        from hsi_sc_nerf import spectral_losses_cpu
 
         a, b = (spectra.numpy(force=True) for spectra in ctx.saved_tensors)
         upstream = gradient.contiguous().numpy(force=True)
         gradients: list[Tensor | None] = [None, None]
         for i, pair in enumerate(((a, b), (b, a))):
             if ctx.needs_input_grad[i]:
-                gradients[i] = torch.from_numpy(spectral_angle_cpu.angle_gradient(*pair, upstream))
+                gradients[i] = torch.from_numpy(spectral_losses_cpu.angle_gradient(*pair, upstream))
         return gradients[0], gradients[1]
+
+
+def mean_square(a: Float[Tensor, "*shape"], b: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
+    """Mean of the squared differences; 0 of none.
+
+    Example:
+        >>> mean_square(torch.tensor([1.0, 2.0]), torch.tensor([1.0, 4.0]))
+        tensor(2.)
+    """
+    if a.device.type == b.device.type == "cpu" and a.dtype == b.dtype == torch.float32 and a.shape == b.shape:
+        return _CompiledMeanSquare.apply(*(values.reshape(-1).contiguous() for values in (a, b)))
+    return narrow(masked_mean((widen(a) - widen(b)).square()), a, b)
+
+
+class _CompiledMeanSquare(torch.autograd.Function):
+    """The mean square of float32 arrays on the processor; it can be differentiated once."""
+
+    @staticmethod
+    def forward(ctx, a: Tensor, b: Tensor) -> Tensor:
+        from hsi_sc_nerf import spectral_losses_cpu
+
+        ctx.save_for_backward(a, b)
+        found = spectral_losses_cpu.mean_square(a.numpy(force=True), b.numpy(force=True))
+        return narrow(torch.tensor(found, dtype=torch.float64), a)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        from hsi_sc_nerf import spectral_losses_cpu
+
+        a, b = (values.numpy(force=True) for values in ctx.saved_tensors)
+        found = torch.from_numpy(spectral_losses_cpu.mean_square_gradient(a, b, gradient.item()))
+        needs_a, needs_b = ctx.needs_input_grad
+        return found if needs_a else None, -found if needs_b else None
 
 
 def one_minus_cosine(

@@ -5,6 +5,7 @@ import torch
 
 from hsi_sc_nerf.numerics import (
     masked_mean,
+    mean_square,
     one_minus_cosine,
     safe_log10,
     safe_ratio,
@@ -125,7 +126,8 @@ def test_angle_is_accurate_in_float32(angle: float, scale: float, bands: int, de
 
 
 @pytest.mark.parametrize(
-    "function", [spectral_angle, one_minus_cosine, lambda a, b: one_minus_cosine(a, b, norm_floor=30.0), safe_ratio]
+    "function",
+    [spectral_angle, one_minus_cosine, lambda a, b: one_minus_cosine(a, b, norm_floor=30.0), safe_ratio, mean_square],
 )
 def test_gradients_match_finite_differences(function, device: str) -> None:
     a, b = (spectra(seed, pixels=3, bands=7).to(device).requires_grad_() for seed in (0, 1))
@@ -185,7 +187,7 @@ def test_roots_and_logarithms_at_the_edges() -> None:
 def test_non_finite_input_is_not_hidden(bad: float, device: str) -> None:
     a, b = torch.full((1, 4), bad, device=device), torch.ones(1, 4, device=device)
     values = (spectral_angle(a, b), one_minus_cosine(a, b), safe_sqrt(a), safe_log10(a), masked_mean(a))
-    for value in (*values, safe_ratio(a, b)):
+    for value in (*values, safe_ratio(a, b), mean_square(a, b)):
         assert not torch.isfinite(value).any()
 
 
@@ -214,6 +216,28 @@ def test_left_out_pixels_touch_nothing() -> None:
 def test_a_mask_of_the_wrong_kind_is_refused(mask: torch.Tensor) -> None:
     with pytest.raises(ValueError, match="mask"):
         select_pixels(torch.ones(2, 3, 5), mask)
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1.0, 1e15])
+def test_the_compiled_mean_square_and_its_gradients_equal_those_in_float64(scale):
+    a, b = scale * spectra().float(), scale * spectra(1).float()
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        pair = [values.to(dtype).requires_grad_() for values in (a, b)]
+        mean = mean_square(*pair)
+        found.append([mean, *torch.autograd.grad(0.7 * mean, pair)])
+    for compiled, exact in zip(*found, strict=True):
+        torch.testing.assert_close(compiled, exact.float(), rtol=1e-5, atol=0.0)
+
+
+def test_the_mean_square_of_the_largest_numbers_and_of_none_is_finite():
+    largest = torch.finfo(torch.float32).max
+    a, b = torch.full((2,), largest, requires_grad=True), torch.full((2,), -largest, requires_grad=True)
+    mean = mean_square(a, b)
+    mean.backward()
+    assert mean.item() == largest
+    torch.testing.assert_close(torch.stack([a.grad, b.grad]), torch.tensor([[largest] * 2, [-largest] * 2]))
+    assert mean_square(a[:0], b[:0]).item() == 0.0
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])

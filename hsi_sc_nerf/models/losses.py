@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hsi_sc_nerf.evaluation.spectral_metrics import cleared, has_angle
-from hsi_sc_nerf.numerics import masked_mean, narrow, one_minus_cosine, spectral_angle, widen
+from hsi_sc_nerf.numerics import masked_mean, mean_square, narrow, one_minus_cosine, spectral_angle, widen
 
 DIRECTION_FLOOR = 1e-4
 """Root mean square reflectance below which a spectrum has no usable direction (a packed count is 2e-5)."""
@@ -42,9 +42,10 @@ def hsi_loss(
         >>> hsi_loss(target + 0.1, target)
         tensor(0.0100)
     """
-    if valid is not None:
-        predicted, target = cleared(predicted, valid), cleared(target, valid)
-    return narrow(masked_mean((widen(predicted) - widen(target)).square(), valid), predicted, target)
+    if valid is None:
+        return mean_square(predicted, target)
+    mean = mean_square(cleared(predicted, valid), cleared(target, valid))
+    return narrow(widen(mean) * (valid.numel() / valid.sum().clamp_min(1)), mean)
 
 
 def angular_loss(
@@ -67,9 +68,14 @@ def angular_loss(
     Raises:
         ValueError: ``valid`` is not boolean, or its shape is not that of the spectra.
     """
-    p, t, counted = _pixels_with_an_angle(predicted, target, valid)
     norm_floor = DIRECTION_FLOOR * math.sqrt(predicted.shape[-1])
-    return narrow(masked_mean(one_minus_cosine(p, t, norm_floor=norm_floor), counted), predicted, target)
+    if valid is None:
+        return masked_mean(one_minus_cosine(predicted, target, norm_floor=norm_floor))
+    # The norm over fewer bands is smaller. Scaled to all bands, it compares with the norm floor.
+    scale = (predicted.shape[-1] / valid.sum(-1, keepdim=True).clamp_min(1)).sqrt()
+    p, t = (widen(cleared(spectra, valid)) * scale for spectra in (predicted, target))
+    loss = masked_mean(one_minus_cosine(p, t, norm_floor=norm_floor), has_angle(valid))
+    return narrow(loss, predicted, target)
 
 
 def angle_loss(
@@ -82,18 +88,6 @@ def angle_loss(
     Unlike that of the cosine, the gradient does not vanish at small angles. Arguments and errors are those of
     `angular_loss`; a zero spectrum costs pi / 2 and has gradient 0.
     """
-    p, t, counted = _pixels_with_an_angle(predicted, target, valid)
-    return narrow(masked_mean(spectral_angle(p, t), counted), predicted, target)
-
-
-def _pixels_with_an_angle(
-    predicted: Tensor, target: Tensor, valid: Tensor | None
-) -> tuple[Float[Tensor, "*pixels bands"], Float[Tensor, "*pixels bands"], Bool[Tensor, "*pixels"] | None]:
-    """Spectra whose flagged values are cleared, and which of them have an angle (None for all)."""
     if valid is None:
-        return predicted, target, None
-    cleared_both = cleared(predicted, valid), cleared(target, valid)
-    # The norm over fewer bands is smaller. Scaled to all bands, it compares with the norm floor.
-    scale = (predicted.shape[-1] / valid.sum(-1, keepdim=True).clamp_min(1)).sqrt()
-    p, t = (widen(spectra) * scale for spectra in cleared_both)
-    return p, t, has_angle(valid)
+        return masked_mean(spectral_angle(predicted, target))
+    return masked_mean(spectral_angle(cleared(predicted, valid), cleared(target, valid)), has_angle(valid))

@@ -1,6 +1,6 @@
-"""The spectral angle of float32 spectra and its gradient as compiled loops, for training without a GPU.
+"""Spectral angle and mean square of float32 spectra, with gradients, as compiled loops for training without a GPU.
 
-Sums are float64, as in `numerics.spectral_angle`, but no spectrum is written to memory in that type.
+Arithmetic is float64, as in `numerics`, but no spectrum is written to memory in that type.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from jaxtyping import Float32
 
 _LARGEST = float(np.finfo(np.float32).max)
 
-_compiled = numba.njit(nogil=True, cache=True, error_model="numpy")
+# Sums in any order, which the processor computes several elements at a time.
+_compiled = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
 
 
 def angles(a: Float32[np.ndarray, "n bands"], b: Float32[np.ndarray, "n bands"]) -> Float32[np.ndarray, "n"]:
@@ -32,6 +33,37 @@ def angle_gradient(
     return gradient
 
 
+def mean_square(a: Float32[np.ndarray, "n"], b: Float32[np.ndarray, "n"]) -> float:
+    """Mean of the squared differences; 0 of none."""
+    return _sum_of_squares(a, b) / max(len(a), 1)
+
+
+def mean_square_gradient(
+    a: Float32[np.ndarray, "n"], b: Float32[np.ndarray, "n"], upstream: float
+) -> Float32[np.ndarray, "n"]:
+    """Gradient of ``upstream`` times their mean square with respect to ``a``."""
+    gradient = np.empty_like(a)
+    _scaled_difference(a, b, 2.0 * upstream / max(len(a), 1), gradient)
+    return gradient
+
+
+@_compiled
+def _sum_of_squares(a, b):
+    total = 0.0
+    for i in range(len(a)):
+        difference = np.float64(a[i]) - np.float64(b[i])
+        total += difference * difference
+    return total
+
+
+@_compiled
+def _scaled_difference(a, b, factor, found):
+    for i in range(len(a)):
+        value = factor * (np.float64(a[i]) - np.float64(b[i]))
+        # Written so that NaN is not hidden.
+        found[i] = -_LARGEST if value < -_LARGEST else _LARGEST if value > _LARGEST else value
+
+
 @_compiled
 def _norm(spectrum):
     total = 0.0
@@ -44,8 +76,9 @@ def _norm(spectrum):
 def _chords(a, b, norm_a, norm_b):
     """Lengths of the difference and of the sum of the unit vectors."""
     difference, total = 0.0, 0.0
+    of_a, of_b = 1.0 / norm_a, 1.0 / norm_b
     for k in range(len(a)):
-        u, v = a[k] / norm_a, b[k] / norm_b
+        u, v = a[k] * of_a, b[k] * of_b
         difference += (u - v) * (u - v)
         total += (u + v) * (u + v)
     return math.sqrt(difference), math.sqrt(total)
@@ -76,7 +109,8 @@ def _angle_gradient(a, b, upstream, gradient):
         # d angle / d u = -(v - cos u) / sin, with 1 - cos = difference^2 / 2 and sin = difference total / 2.
         factor = -upstream[i] / (norm_a * 0.5 * difference * total)
         past = 0.5 * difference * difference
+        of_a, of_b = 1.0 / norm_a, 1.0 / norm_b
         for k in range(a.shape[1]):
-            u, v = a[i, k] / norm_a, b[i, k] / norm_b
+            u, v = a[i, k] * of_a, b[i, k] * of_b
             value = factor * ((v - u) + past * u)
             gradient[i, k] = min(max(value, -_LARGEST), _LARGEST)
