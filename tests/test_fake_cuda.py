@@ -93,7 +93,8 @@ def on_gpu(request, flagged_dataset):
     manager = pipeline.datamanager
     frames, masks = manager.train_dataset.frames, manager.train_pixel_sampler.masks
     pixels = DevicePixels(frames, masks, "cpu", has_flagged=True)
-    rays = CameraRays(manager.train_dataset.cameras, quarters=True)
+    rays = CameraRays(manager.train_dataset.cameras)
+    rays(torch.zeros(1, 3, dtype=torch.int64), quartered=1)  # makes its tables, which follow to the GPU
     mode = FakeTensorMode()
     move_module(pipeline.model, mode)
     collider = pipeline.model.collider
@@ -116,6 +117,12 @@ def test_a_training_step_stays_on_the_device(on_gpu):
         loss, terms, metrics = forward_pass(model, rays, on_gpu.pixels(on_gpu.indices))
     assert loss.device.type == "cuda"
     assert {value.device.type for value in (*terms.values(), *metrics.values())} == {"cuda"}
+
+
+@pytest.mark.slow
+def test_rays_of_pixels_that_were_read_from_files_are_on_the_device(on_gpu):
+    rays = on_gpu.rays(torch.zeros(RAYS, 3, dtype=torch.int64), quartered=RAYS // 4)
+    assert {rays.origins.device.type, rays.directions.device.type, rays.camera_indices.device.type} == {"cuda"}
 
 
 @pytest.mark.slow

@@ -5,6 +5,8 @@ Such a pixel shows the object and what is behind it, each by the area that it co
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import torch
 from jaxtyping import Int
 from nerfstudio.cameras.cameras import Cameras
@@ -14,6 +16,8 @@ from torch import Tensor
 
 QUARTERS = 4
 """Rays through a pixel that is supersampled."""
+_LINES = 16
+"""Lines of the image whose rays are computed at once: nerfstudio needs a kilobyte for a ray."""
 _OFFSETS_PX = ((-0.25, -0.25), (-0.25, 0.25), (0.25, -0.25), (0.25, 0.25))
 """Centres of the quarters (line, sample) beside the pixel's."""
 
@@ -26,27 +30,30 @@ class CameraRays:
 
     Args:
         cameras: cameras of the frames, on the device.
-        quarters: whether rays through quarters are asked for.
     """
 
-    def __init__(self, cameras: Cameras, *, quarters: bool = False) -> None:
+    def __init__(self, cameras: Cameras) -> None:
+        self._camera = cameras[:1]
         self._poses = cameras.camera_to_worlds.clone()
         self._metadata = {key: value.clone() for key, value in (cameras.metadata or {}).items()}
-        to_camera = self._poses[0, :, :3]  # R^T d
-        self._centres = _table(cameras.generate_rays(camera_indices=0), to_camera)
-        if quarters:
-            lines, samples = self._centres[0].shape[:2]
-            pixels = torch.cartesian_prod(torch.arange(lines), torch.arange(samples)).view(lines, samples, 2)
-            self._quarters = _table(rays_through_quarters(cameras, pixels), to_camera)
+        self._centres = _table(self._camera.generate_rays(camera_indices=0), self._camera)
+
+    @cached_property
+    def _quarters(self) -> list[Tensor]:
+        """As `_centres`, through the quarters: four times as large, and only training asks for it."""
+        lines, samples = self._centres[0].shape[:2]
+        pixels = torch.cartesian_prod(torch.arange(lines), torch.arange(samples)).view(lines, samples, 2)
+        blocks = [_table(rays_through_quarters(self._camera, some), self._camera) for some in pixels.split(_LINES)]
+        return [torch.cat(parts) for parts in zip(*blocks, strict=True)]
 
     def __call__(self, pixels: Int[Tensor, "count 3"], quartered: int = 0) -> RayBundle:
         """Rays of pixels (frame, line, sample).
 
         Args:
-            pixels: the pixels.
+            pixels: the pixels, on any device.
             quartered: how many of them, the last, have `QUARTERS` rays each, one after the other.
         """
-        frame, line, sample = pixels.unbind(dim=-1)
+        frame, line, sample = pixels.to(self._poses.device).unbind(dim=-1)
         first = len(pixels) - quartered
         found = [table[line[:first], sample[:first]] for table in self._centres]
         if quartered > 0:
@@ -82,7 +89,8 @@ def rays_through_quarters(
     return cameras.generate_rays(camera_indices=0, coords=coords, obb_box=obb_box)
 
 
-def _table(rays: RayBundle, to_camera: Tensor) -> list[Tensor]:
-    """Directions in the camera's frame, areas and norms of rays."""
+def _table(rays: RayBundle, camera: Cameras) -> list[Tensor]:
+    """Directions in the camera's frame, areas and norms of its rays."""
     assert rays.metadata is not None
+    to_camera = camera.camera_to_worlds[0, :, :3]  # R^T d
     return [rays.directions @ to_camera, rays.pixel_area, rays.metadata["directions_norm"]]

@@ -116,7 +116,7 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
     def setup_train(self) -> None:
         """Open the training cubes."""
         self.train_pixel_sampler = self._pixel_sampler(self.train_dataset, self.config.train_num_rays_per_batch)
-        self._train_rays = CameraRays(self.train_dataset.cameras.to(self.device), quarters=True)
+        self._train_rays = CameraRays(self.train_dataset.cameras.to(self.device))
         self._held: DevicePixels | None = None
         if self.config.hold_on_gpu and fits_on_gpu(self.train_dataset.frames, torch.device(self.device)):
             masks, flagged = self.train_pixel_sampler.masks, self.train_dataset.has_flagged

@@ -41,7 +41,7 @@ def test_rays_through_centres_are_nerfstudios(distortion, device):
 @pytest.mark.parametrize("distortion", [(0.0, 0.0, 0.0, 0.0), DISTORTED])
 def test_the_last_pixels_have_the_rays_of_a_camera_of_twice_the_resolution(distortion, device):
     made = cameras(distortion)
-    found = CameraRays(made.to(device), quarters=True)(PIXELS.to(device), quartered=2)
+    found = CameraRays(made.to(device))(PIXELS.to(device), quartered=2)
     assert found.shape == (3 + 2 * QUARTERS,)
     finer = cameras(distortion)
     finer.rescale_output_resolution(2.0)
