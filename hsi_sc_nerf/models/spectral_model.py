@@ -85,7 +85,7 @@ class SpectralModelConfig(NerfactoModelConfig):
     """Weight of the distortion loss, which concentrates the density along a ray. Distances are scene units, or with
     proposal networks fractions of the ray (docs/notes/dead_ends.md)."""
     predict_normals: bool = False
-    """Predict normals, as the paper does. Steps take half again as long, and the cloud has the density's."""
+    """Predict normals, as the paper does. Steps take half again as long; a cloud's normals are not these."""
     near_plane: float = 0.01
     """Least distance of samples from the camera, scene units."""
     disable_scene_contraction: bool = True
@@ -101,7 +101,7 @@ class SpectralModelConfig(NerfactoModelConfig):
     match_resolution: bool = True
     """Size the field's hash grid by what a pixel resolves. False: by num-levels, max-res and log2-hashmap-size."""
     average_init_density: float = 0.1
-    """Initial density; the box starts nearly empty."""
+    """Density of an untrained field. With an occupancy grid, training begins solid inside the masks' hull instead."""
     use_appearance_embedding: bool = False
     """Learn an appearance of each view. Calibrated reflectance under fixed lamps needs none."""
     implementation: Literal["tcnn", "torch"] = "torch"
@@ -121,10 +121,10 @@ class SpectralModelConfig(NerfactoModelConfig):
                 )
             if self.basis_size is not None and self.basis_size < 1:
                 raise InputError("--pipeline.model.basis-size must be at least 1.")
-            if self.head == "basis" and self.background == "last-sample":
+            if self.background == "last-sample" and (self.head == "basis" or self.num_proposal_iterations == 0):
                 raise InputError(
-                    "--pipeline.model.background last-sample needs a value in every band at each sample; take "
-                    "--pipeline.model.head direct with it."
+                    "--pipeline.model.background last-sample needs values in all bands behind the object; take "
+                    "--pipeline.model.head direct and --pipeline.model.num-proposal-iterations 2 with it."
                 )
         except InputError as error:
             raise SystemExit(f"hsi-sc-nerf: {error}") from error

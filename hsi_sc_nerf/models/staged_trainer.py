@@ -1,4 +1,4 @@
-"""Trainer that runs all stages in one run, resumes killed runs to the same weights and skips non-finite steps."""
+"""Trainer that runs all stages in one run, resumes killed runs and skips non-finite steps."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class StagedTrainerConfig(TrainerConfig):
     masked: StageConfig = field(default_factory=masked_stage)
     """Second stage: the masked object, and some background rays."""
     preset: Preset | None = None
-    """fast, balanced or best: iterations and rays a step for the device. An option of your own goes before it."""
+    """fast, balanced or best: iterations and rays a step. Your own go before it, unless they equal those of balanced."""
     max_train_seconds: float | None = between(0.001, math.inf, default=None)
     """End the run after so many seconds of training instead of --max-num-iterations; stages and learning rates follow
     the clock. Evaluations and saving do not count. Two such runs do not have the same weights bit by bit."""
@@ -227,7 +227,9 @@ class StagedTrainer(Trainer):
 
         if sampler is not None:
             self._steps_since_update = sampler._steps_since_update + 1
-        warning = self._guard.record(step, non_finite_names(loss_dict), self.optimizers.skipped_groups)
+        skipped = self.optimizers.skipped_groups
+        names = non_finite_names(loss_dict) if skipped or self.grad_scaler.is_enabled() else []
+        warning = self._guard.record(step, names, skipped)
         if warning is not None:
             CONSOLE.print(f"[yellow]{escape(warning)}")
         if step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
@@ -248,7 +250,7 @@ class StagedTrainer(Trainer):
         try:
             found = steps((self.schedule.stage.config.name, frozenset(self._frozen or ())), rays, batch, seed)
         except RuntimeError as error:
-            CONSOLE.print(f"[yellow]Steps are launched one operation at a time: {escape(str(error))}")
+            CONSOLE.print(f"[yellow]Training goes on, but more slowly; no graph of a step: {escape(str(error))}")
             self._captured = None
             seed()
             return super().train_iteration(step)

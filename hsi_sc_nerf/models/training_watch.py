@@ -78,7 +78,8 @@ class NonFiniteGuard:
         sentence = f"step {step} skipped: {', '.join(causes)} not finite"
         if self.in_a_row >= MAX_SKIPPED_IN_A_ROW:
             raise TrainingDivergedError(
-                f"{sentence}, the last of {self.in_a_row} in a row; lower the learning rate, or look for "
+                f"{sentence}, the last of {self.in_a_row} in a row; lower the learning rate "
+                "(--optimizers.fields.optimizer.lr), or look for "
                 "damaged frames"
             )
         return sentence
@@ -118,7 +119,8 @@ class RisenLossGuard:
         if self.risen_in_a_row == MAX_RISEN_IN_A_ROW or (self.risen_in_a_row and schedule.stage_complete):
             raise TrainingDivergedError(
                 f"step {step}: the loss is {now / self._least:.3g} times the least one of its stage, and has been "
-                f"more than {RISEN_FACTOR:g} times for {self.risen_in_a_row} steps; lower the learning rate"
+                f"more than {RISEN_FACTOR:g} times for {self.risen_in_a_row} steps; lower the learning rate "
+                "(--optimizers.fields.optimizer.lr)"
             )
 
 

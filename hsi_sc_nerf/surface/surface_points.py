@@ -110,8 +110,8 @@ def sample_surface_points(
     mesh = surface_mesh(model, renders, box, rays_per_batch, touching_opacity)
     if mesh is None:
         raise InputError(
-            f"the model holds no object: no ray through the foreground reaches an opacity of {MIN_OPACITY}; train "
-            "longer, and look at the masks in the dataset's report folder."
+            "the model holds no object: it shows no surface inside the object's box; look in the dataset's report "
+            "folder whether the masks show the object and not its container, and if they do, train longer."
         )
     found = 0
 

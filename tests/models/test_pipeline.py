@@ -216,6 +216,12 @@ def test_a_basis_has_no_spectrum_at_the_last_sample(flagged_dataset):
         replace(config, head="basis", background="last-sample")
 
 
+def test_an_occupancy_grid_has_no_sample_behind_the_object(flagged_dataset):
+    config = pipeline_config(flagged_dataset).model
+    with pytest.raises(SystemExit, match=r"--pipeline\.model\.num-proposal-iterations"):
+        replace(config, head="direct", background="last-sample", num_proposal_iterations=0)
+
+
 @pytest.mark.slow
 def test_nerfstudios_rgba_pictures_are_opaque(pipeline):
     rgb = torch.rand(3, 4, 3)
