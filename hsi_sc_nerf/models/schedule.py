@@ -1,6 +1,6 @@
 """Which stage a run is in, and when it ends: by its iterations, or by the seconds of a clock.
 
-A run of so many iterations depends on the steps' numbers alone, so that a processor repeats it bit by bit. A timed run
+A run of so many iterations depends on the steps' numbers alone, so a processor repeats it bit by bit. A timed run
 takes as many steps as fit: its stages and learning rates follow the elapsed fraction of its seconds.
 """
 
