@@ -19,7 +19,13 @@ from hsi_sc_nerf.calibration.lamp_drift import NotMeasurable
 from hsi_sc_nerf.calibration.reflectance import PixelCounts
 from hsi_sc_nerf.calibration.session_calibration import SessionCalibration
 from hsi_sc_nerf.calibration.white_reference import TARP_BRIGHTNESS
-from hsi_sc_nerf.calibration.white_source import WhiteSource, checked_source, exposure_ratio, white_exposure_ratio
+from hsi_sc_nerf.calibration.white_source import (
+    WhiteSource,
+    checked_source,
+    exposure_ratio,
+    panel_reflectance,
+    white_exposure_ratio,
+)
 from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.findings import Finding, Level
 from hsi_sc_nerf.morphology import largest_component
@@ -44,6 +50,8 @@ MIN_MOVING_PX = 50
 ALIKE, BRIGHTER = 0.5, 0.2
 """A capture is one of the frames if at least this fraction of the moving pixels looks like the frames, and less than
 this fraction of its brightest region is brighter than the frames there."""
+EVEN = 0.5
+"""A described panel is none of the frames if it scatters less than this, relative to them, over the moving pixels."""
 SHADE_PX, SHADE_FRACTION, SHADE_BETWEEN, SHADE_LEVEL = 5, 0.1, 0.08, 0.85
 """Pixels that are averaged, least fraction of the white in shade and in light, largest fraction in the middle third
 between the two levels (even gradients have 0.17), and the darker level over the brighter."""
@@ -75,7 +83,7 @@ def check_white(session: Session, source: Literal["auto"] | WhiteSource = "auto"
         ``white-clipped`` (values above the white's: amber from 1 %, red from 5 %).
 
     Raises:
-        InputError: the session does not have that source of white.
+        InputError: the session does not have that source of white, or its panel's reflectance cannot be read.
 
     Example:
         >>> refuse_red(check_white(open_session(Path("captures"))))
@@ -90,9 +98,14 @@ def check_white(session: Session, source: Literal["auto"] | WhiteSource = "auto"
     else:
         of_white = Finding("white", "red", f"{session.path}: {fault}.", values)
     level: Level = "red" if clipped > ABOVE_RED else "amber" if clipped > ABOVE_AMBER else "green"
+    described = session.panel_reflectance_path is not None
     text = f"{100.0 * clipped:.2g} % of the frames' values are brighter than {white}"
+    if described:
+        text += " would be with a reflectance of 1"
     if level != "green":
-        text = f"{session.path}: {text} and will be clipped; check that it is a white taken under the frames' light"
+        advice = "is what its panel_reflectance says" if described else "is white, or give its panel_reflectance"
+        text = f"{session.path}: {text} and will be clipped"
+        text = f"{text}; check that it was taken under the frames' light and {advice}"
     found_clipped = Finding("white-clipped", level, f"{text}.", {"fraction": clipped})
     if fault is not None or not values.get("two_levels"):
         return [of_white, found_clipped]
@@ -114,19 +127,21 @@ def _check_tarp(session: Session) -> tuple[str | None, float, dict[str, object]]
     if not brightest > 0.0:
         return f"the white {tarp.name} is dark; take it again", 0.0, {}
     white = np.median(light[region], axis=0)
+    perfect = white / panel_reflectance(session)
     live = ~unlit_bands(white[None]) & tarp.cube.good_bands
     exposures = np.array([exposure_ratio(tarp, frame) for frame in frames])
-    images, clipped, outshone = _compare_with_white(frames, [white[None] / ratio for ratio in exposures], live)
+    images, clipped, outshone = _compare_with_white(frames, [perfect[None] / ratio for ratio in exposures], live)
     differences = np.abs(np.diff(image, axis=1)) / np.maximum(image[:, 1:], 1e-9)
     two_levels = is_partly_shaded(image, region)
     roughness = float(np.median(differences[region[:, 1:]])) if region[:, 1:].any() else np.inf
-    brighter, alike, looks_white = 1.0, 0.0, None
+    brighter, alike, scatter, looks_white = 1.0, 0.0, 0.0, None
     if images.shape[1:] == image.shape:
         image = light[..., live].mean(axis=-1)
-        brighter, alike, best = _compare_with_frames(image, region, images * exposures[:, None, None])
+        brighter, alike, scatter, best = _compare_with_frames(image, region, images * exposures[:, None, None])
         looks_white = None if best is None else frames[best].name
     fault = None
-    if brighter < BRIGHTER and alike >= ALIKE:
+    is_grey_panel = session.panel_reflectance_path is not None and scatter < EVEN
+    if brighter < BRIGHTER and alike >= ALIKE and not is_grey_panel:
         fault = "shows the same as the frames, and no part of it is brighter"
     elif outshone > OUTSHONE_FRACTION:
         fault = "is too dark or coloured: the frames are over twice as bright in some bands"
@@ -171,12 +186,13 @@ def _compare_with_frames(
     image: Float[np.ndarray, "lines samples"],
     region: Bool[np.ndarray, "lines samples"],
     frames: Float[np.ndarray, "frames lines samples"],
-) -> tuple[float, float, int | None]:
+) -> tuple[float, float, float, int | None]:
     """Compare the white's brightness with that of the frames, pixel by pixel.
 
     Returns:
         The fraction of the white's region that is brighter than the frames there; the fraction of the moving pixels
-        that look like the frames; and the frame that looks like a white, if one does.
+        that look like the frames; the white's scatter over these pixels relative to that of the frames; and the frame
+        that looks like a white, if one does.
     """
     usual = np.median(np.concatenate([frames, image[None]]), axis=0)
     outshines = (frames > MARGIN * usual).mean(axis=(1, 2))
@@ -187,19 +203,22 @@ def _compare_with_frames(
     if moving.sum() < MIN_MOVING_PX:
         moving = np.ones_like(moving)
     inside = (image >= low / MARGIN) & (image <= high * MARGIN)
-    return float((image > MARGIN * high)[region].mean()), float(inside[moving].mean()), best
+    scatter = [float(picture[moving].std() / max(picture[moving].mean(), 1e-9)) for picture in (image, *others)]
+    relative = scatter[0] / max(float(np.median(scatter[1:])), 1e-9)
+    return float((image > MARGIN * high)[region].mean()), float(inside[moving].mean()), relative, best
 
 
 def _check_own_whites(session: Session) -> tuple[str | None, float, dict[str, object]]:
     """As `_check_tarp`, for WHITEREF cubes."""
     whites, uneven, good_bands = [], {}, np.ones(len(session.wavelengths_nm), bool)
+    of_panel = panel_reflectance(session)
     for frame in session.frames:
         assert frame.white is not None
         light = light_of_some_lines(frame.white, frame.white_dark)
         columns = np.median(light, axis=0)
         if len(columns) != frame.cube.shape[1]:
             columns = np.median(columns, axis=0, keepdims=True)
-        whites.append(columns / white_exposure_ratio(session, "capture", frame))
+        whites.append(columns / of_panel / white_exposure_ratio(session, "capture", frame))
         low, middle, high = np.percentile(light.mean(axis=-1), [10.0, 50.0, 90.0], axis=0)
         uneven[frame.name] = float(np.median((high - low) / np.maximum(middle, 1e-9)))
         good_bands &= frame.cube.good_bands
@@ -216,7 +235,7 @@ def _check_own_whites(session: Session) -> tuple[str | None, float, dict[str, ob
 def _compare_with_white(
     frames: Sequence[Capture], whites: Sequence[Float[np.ndarray, "columns bands"]], live: Bool[np.ndarray, "bands"]
 ) -> tuple[Float[np.ndarray, "frames lines samples"], float, float]:
-    """Compare frames with their whites, which are scaled to the frames' exposures.
+    """Compare frames with their whites, which are scaled to the frames' exposures and a reflectance of 1.
 
     Returns:
         Brightness of the frames' lines; the fraction of values above the white's; and, of the worst live band, the

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -37,7 +36,7 @@ from hsi_sc_nerf.calibration.white_source import (
     WhiteSource,
     exposure_ratio,
     measure_whites,
-    read_panel,
+    panel_reflectance,
     white_cubes,
     white_exposure_ratio,
     white_source,
@@ -64,9 +63,6 @@ class CalibrationConfig:
     roi: tuple[int, int, int, int] | None = between(0, 10**6, default=None)
     """Region of the white in the image as the file holds it: x0 y0 x1 y1 in pixels, x1 and y1 excluded. By default, a
     tarp is found by its brightness; a white target needs this."""
-    panel: Path | None = None
-    """CSV file with the white's own reflectance by wavelength (nm, and a fraction or percent). By default, the white
-    has reflectance 1 in all bands."""
     bounds: tuple[float, float] = between(-100.0, 100.0, default=paper.REFLECTANCE_BOUNDS)
     """Reflectance is clipped to this range."""
     flat_field: bool = False
@@ -150,14 +146,11 @@ def _from_products(session: Session, config: CalibrationConfig) -> SessionCalibr
 
 def _from_counts(session: Session, source: WhiteSource, config: CalibrationConfig) -> SessionCalibration:
     captures = session.frames
-    lines, samples, bands = captures[0].cube.shape
+    lines, samples, _ = captures[0].cube.shape
     darks = _dark_spectra(captures)
     defects = _defects(session, source, config)
     whites = measure_whites(session, source, config.roi, defects)
-    panel = np.ones(bands)
-    panel_path = config.panel or session.panel_reflectance_path
-    if panel_path is not None:
-        panel = read_panel(panel_path, session.wavelengths_nm)
+    panel = panel_reflectance(session)
     noise = _noise(session, source, whites[0], defects)
     drift = _drift(session, darks, noise, defects)
     # A white in every frame drifts with the lamps.

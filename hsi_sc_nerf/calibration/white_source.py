@@ -107,6 +107,16 @@ def _ratio(one_ms: float | None, other_ms: float | None) -> float:
     return 1.0 if one_ms is None or other_ms is None else one_ms / other_ms
 
 
+def panel_reflectance(session: Session) -> Float[np.ndarray, "bands"]:
+    """Reflectance of the session's white at its bands; 1 where ``session.json`` names no certificate.
+
+    Raises:
+        InputError: the certificate cannot be used (`read_panel`).
+    """
+    path = session.panel_reflectance_path
+    return np.ones(len(session.wavelengths_nm)) if path is None else read_panel(path, session.wavelengths_nm)
+
+
 def read_panel(path: Path, wavelengths_nm: Float[np.ndarray, "bands"]) -> Float[np.ndarray, "bands"]:
     """Reflectance of a panel at the band centres, by linear interpolation.
 

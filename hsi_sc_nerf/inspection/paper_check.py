@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.calibration.white_source import exposure_ratio, read_panel
+from hsi_sc_nerf.calibration.white_source import exposure_ratio, panel_reflectance
 from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.findings import Finding, Level, judged
 from hsi_sc_nerf.inspection.quicklook import PICTURE_NM, Quicklook
@@ -58,9 +58,7 @@ def check_paper(session: Session, quicklooks: Sequence[Quicklook], detections: S
 
 
 def _of_paper(session: Session, paper: float, markers: int) -> Finding:
-    if session.panel_reflectance_path is not None:
-        of_panel = read_panel(session.panel_reflectance_path, session.wavelengths_nm)
-        paper *= float(of_panel[nearest_bands(session.wavelengths_nm, PICTURE_NM)].mean())
+    paper *= float(panel_reflectance(session)[nearest_bands(session.wavelengths_nm, PICTURE_NM)].mean())
     values = {"reflectance": paper, "markers": markers}
     text = f"the markers' white paper has a reflectance of {paper:.2g}"
     if USUAL[0] <= paper <= USUAL[1]:

@@ -122,7 +122,8 @@ def process_session(
     console = Console(stderr=True, quiet=not progress, markup=False, emoji=False)
 
     session = open_session(session_dir, exclude=config.exclude, skip_damaged=config.skip_damaged)
-    fingerprint = session_fingerprint(session, config, _named_files(config))
+    named = [] if config.camera is None else [transforms_path(config.camera)]
+    fingerprint = session_fingerprint(session, config, named)
     if _is_up_to_date(output_dir, fingerprint):
         console.print(f"{output_dir}: is up to date.")
         return output_dir
@@ -215,12 +216,6 @@ def _inspect(
     if no_scale and not session.info_path.is_file():
         console.print(suggestion(session, inspection.session_json), highlight=False, soft_wrap=True)
     return inspection.session, SessionChecks(inspection, config.accept, output_dir)
-
-
-def _named_files(config: ProcessConfig) -> list[Path]:
-    """Files outside of the session that settings name and the dataset depends on."""
-    panel, camera = config.calibration.panel, config.camera
-    return ([] if panel is None else [panel]) + ([] if camera is None else [transforms_path(camera)])
 
 
 def _is_up_to_date(output_dir: Path, fingerprint: str) -> bool:

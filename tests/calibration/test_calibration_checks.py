@@ -187,6 +187,40 @@ def test_what_is_dark_coloured_or_rough_is_no_white(session, white, clipped):
     assert clipped in ("amber", findings["white-clipped"].level)
 
 
+@pytest.mark.parametrize("grey", [0.4, 0.2])
+@pytest.mark.parametrize("wall", [0.1, 0.6])
+def test_a_grey_panel_is_a_white_where_its_reflectance_is_given(session, grey, wall):
+    frames = [frame(number, wall) for number in range(FRAMES)]
+    findings, opened = session(grey * np.linspace(1.0, 1.05, SAMPLES)[:, None] * np.ones((LINES, 1, BANDS)), frames)
+    assert findings["white-clipped"].level == "red"
+    described = panel_of(opened, grey)
+    assert [finding.level for finding in check_white(described)] == ["green", "green"]
+    for capture in described.frames:  # the same of WHITEREF cubes
+        header = capture.cube.header_path
+        counts = np.rint(grey * np.ones((3, SAMPLES, BANDS)) * LAMP).astype(np.uint16)
+        write_cube(header.with_name(f"WHITEREF_{header.name}"), counts, wavelengths_nm=WAVELENGTHS_NM)
+    own = open_session(opened.path)
+    assert [finding.level for finding in check_white(own, "capture")] == ["green", "green"]
+
+
+@pytest.mark.parametrize("grey", [0.99, 0.4])
+def test_a_frame_is_no_grey_panel(session, grey):
+    _, opened = session(frame(FRAMES))
+    assert check_white(panel_of(opened, grey))[0].level == "red"
+
+
+def test_a_panel_whose_reflectance_is_stated_too_high(session):
+    _, opened = session(0.2 * np.ones((LINES, SAMPLES, BANDS)))
+    assert [finding.level for finding in check_white(panel_of(opened, 0.5))] == ["green", "red"]
+
+
+def panel_of(opened, reflectance):
+    """The session with a certificate of its white."""
+    (opened.path / "panel.csv").write_text(f"400,{reflectance}\n1000,{reflectance}\n")
+    (opened.path / "session.json").write_text('{"panel_reflectance": "panel.csv"}')
+    return open_session(opened.path)
+
+
 def test_a_longer_exposure_of_the_frames_is_taken_into_account(session):
     _, opened = session(tarp())
     for capture in opened.frames:

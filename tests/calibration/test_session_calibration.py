@@ -1,6 +1,6 @@
 """Whole sessions of known truth through the calibration: what is not saturated is right, and what is, is flagged."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -261,6 +261,7 @@ def test_settings_that_do_not_fit(tiny, config, option):
 def test_a_panel_that_is_no_perfect_white(tiny, tmp_path):
     (tmp_path / "panel.csv").write_text("wavelength_nm,reflectance\n350,0.9\n1050,0.8\n")
     perfect = calibrate_session(tiny, CalibrationConfig())
-    panel = calibrate_session(tiny, CalibrationConfig(panel=tmp_path / "panel.csv"))
+    info = replace(tiny.info, panel_reflectance=str(tmp_path / "panel.csv"))
+    panel = calibrate_session(replace(tiny, info=info), CalibrationConfig())
     expected = np.interp(tiny.wavelengths_nm, [350.0, 1050.0], [0.9, 0.8])
     np.testing.assert_allclose(panel.frames[0].gain / perfect.frames[0].gain, expected[None], rtol=1e-12)

@@ -198,11 +198,12 @@ def test_the_same_input_is_processed_once_and_other_settings_redo_what_depends_o
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["panel", "camera"])
-def test_a_changed_file_that_a_setting_names_is_noticed(session, tmp_path, kind):
+def test_a_changed_file_that_the_session_or_a_setting_names_is_noticed(session, tmp_path, kind):
     if kind == "panel":
-        named = tmp_path / "panel.csv"
+        named = session / "panel.csv"
         named.write_text("400,1.0\n1000,1.0\n")
-        config = ProcessConfig(calibration=CalibrationConfig(panel=named))
+        (session / "session.json").write_text(json.dumps({**INFO, "panel_reflectance": "panel.csv"}))
+        config = ProcessConfig()
     else:
         named = run(session, tmp_path / "earlier") / "transforms.json"
         config = ProcessConfig(camera=named.parent)
