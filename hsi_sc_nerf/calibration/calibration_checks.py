@@ -21,10 +21,10 @@ from hsi_sc_nerf.calibration.session_calibration import SessionCalibration
 from hsi_sc_nerf.calibration.white_reference import TARP_BRIGHTNESS
 from hsi_sc_nerf.calibration.white_source import (
     WhiteSource,
-    checked_source,
     exposure_ratio,
     panel_reflectance,
     white_exposure_ratio,
+    white_source,
 )
 from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.findings import Finding, Level
@@ -76,7 +76,7 @@ def check_white(session: Session, source: Literal["auto"] | WhiteSource = "auto"
 
     Args:
         session: its captures.
-        source: where the white is. A target inside the frames is not checked, because its place is a setting.
+        source: where the white is. A target in the frames is not checked: the calibration measures it in its place.
 
     Returns:
         The findings ``white`` (red if the white is none), ``white-shade`` (amber if a part of a tarp is darker) and
@@ -88,9 +88,11 @@ def check_white(session: Session, source: Literal["auto"] | WhiteSource = "auto"
     Example:
         >>> refuse_red(check_white(open_session(Path("captures"))))
     """
-    found = checked_source(session, source)
+    found = white_source(session, source)
     if found == "product":
         return [Finding("white", "green", "The instrument's finished reflectance needs no white.")]
+    if found == "target":
+        return [Finding("white", "green", "White: a target in every frame, which the calibration measures.")]
     fault, clipped, values = _check_tarp(session) if found == "tarp" else _check_own_whites(session)
     white = f"the capture {session.white.name}" if session.white and found == "tarp" else "the white of each capture"
     if fault is None:

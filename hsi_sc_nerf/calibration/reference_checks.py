@@ -18,7 +18,7 @@ from jaxtyping import Float
 from scipy.ndimage import median_filter
 
 from hsi_sc_nerf.calibration.detector import light_of_some_lines, some_lines, unlit_bands
-from hsi_sc_nerf.calibration.white_source import WhiteSource, checked_source, white_cubes
+from hsi_sc_nerf.calibration.white_source import WhiteSource, white_cubes, white_source
 from hsi_sc_nerf.capture.envi import Cube
 from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.findings import Finding, judged, leave_out, names_in_short
@@ -60,7 +60,7 @@ def check_dark(
     Example:
         >>> refuse_red([check_dark(open_session(Path("captures")))])
     """
-    found = checked_source(session, source)
+    found = white_source(session, source)
     if found == "product":
         return Finding("dark", "green", "The instrument's finished reflectance needs no dark reference.")
     exposures = _exposures(session, found)
@@ -75,6 +75,7 @@ def check_dark(
         frames = [frame.name for frame in session.frames if frame.name in without]
         advice = f" or leave out with {leave_out(frames)}" if 0 < len(frames) < len(session.frames) else ""
         return Finding("dark", "red", f"{sentence}{advice}.", {"without": without})
+    # With a target, this is the brightest part of the first frame.
     white = np.percentile(some_lines(white_cubes(session, found)[0]), 95.0, axis=(0, 1))
     with_data, lit = ~unlit_bands(white[None]), {}
     for exposure in exposures:
@@ -118,10 +119,11 @@ def check_lines(
     Raises:
         InputError: the session does not have that source of white.
     """
-    found = checked_source(session, source)
+    found = white_source(session, source)
     wavelengths_nm = session.wavelengths_nm
     steps_nm = np.abs(np.diff(wavelengths_nm))
-    if found == "product" or len(wavelengths_nm) < FEWEST_BANDS or np.median(steps_nm) > LARGEST_STEP_NM:
+    # A target is in the frames' own light, and in the frames that would be compared with it.
+    if found in ("product", "target") or len(wavelengths_nm) < FEWEST_BANDS or np.median(steps_nm) > LARGEST_STEP_NM:
         return []
     cube, dark = white_cubes(session, found)
     white = bright_pixels(light_of_some_lines(cube, dark)).mean(axis=0)

@@ -120,7 +120,12 @@ def calibrate_session(session: Session, config: CalibrationConfig) -> SessionCal
             f"--calibration.bounds {low:g} {high:g}: reflectance is kept from 0 to {LARGEST_REFLECTANCE:.4g}; give "
             "two ascending numbers within that."
         )
-    source = white_source(session, config.white_source, config.roi)
+    source = white_source(session, config.white_source)
+    if source == "target" and config.roi is None:
+        raise InputError(
+            f"{session.path}: where the white target is in the frames is not known; give its place with "
+            "--calibration.roi."
+        )
     return _from_products(session, config) if source == "product" else _from_counts(session, source, config)
 
 

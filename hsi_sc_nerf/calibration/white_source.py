@@ -16,6 +16,7 @@ from hsi_sc_nerf.calibration.detector import Defects
 from hsi_sc_nerf.calibration.white_reference import Roi, White, column_white, white_reference
 from hsi_sc_nerf.capture.envi import Cube
 from hsi_sc_nerf.capture.session import Capture, Session
+from hsi_sc_nerf.capture.session_info import SESSION_INFO_NAME
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.number_table import read_number_table
 
@@ -27,20 +28,11 @@ SHORTEST_NM = 100.0
 _FORMAT = "two columns, wavelength_nm and reflectance"
 
 
-def checked_source(session: Session, source: Literal["auto"] | WhiteSource) -> WhiteSource:
-    """The source of white that checks look at. A target inside the frames is not checked: its place is a setting.
-
-    Raises:
-        InputError: the session does not have it.
-    """
-    return white_source(session, "auto" if source == "target" else source, None)
-
-
-def white_source(session: Session, source: Literal["auto"] | WhiteSource, roi: Roi | None) -> WhiteSource:
+def white_source(session: Session, source: Literal["auto"] | WhiteSource = "auto") -> WhiteSource:
     """The given source of white, or the first of tarp, capture and product that the session has.
 
     Raises:
-        InputError: the session does not have it, or it is a target and ``roi`` is None.
+        InputError: the session does not have it, or none of the three.
     """
     available: dict[WhiteSource, tuple[bool, str]] = {
         "tarp": (session.white is not None and session.has_counts, "has no capture of a white tarp"),
@@ -49,17 +41,30 @@ def white_source(session: Session, source: Literal["auto"] | WhiteSource, roi: R
         "target": (session.has_counts, "does not have raw counts of every frame"),
     }
     if source == "auto":
-        # open_session refuses sessions without any of the first three.
-        return next(source for source, (is_available, _) in available.items() if is_available)
+        order: tuple[WhiteSource, ...] = ("tarp", "capture", "product")
+        for first in order:
+            if available[first][0]:
+                return first
+        raise InputError(_no_white(session))
     is_available, missing = available[source]
     if not is_available:
         raise InputError(f"{session.path}: {missing}; choose another --calibration.white-source, or auto.")
-    if source == "target" and roi is None:
-        raise InputError(
-            f"{session.path}: where the white target is in the frames is not known; give its place with "
-            "--calibration.roi."
-        )
     return source
+
+
+def _no_white(session: Session) -> str:
+    """The sentence that refuses a session without a way to reflectance for every frame."""
+    without = next((frame for frame in session.frames if not frame.has_counts), None)
+    if session.white is not None and without is not None:
+        return (
+            f"{without.cube.header_path}: there are no raw counts of this frame, but of other frames there is "
+            "nothing else; copy its raw cube too, or the REFLECTANCE cube of every frame."
+        )
+    return (
+        f"{session.path}: has no capture called {session.info.white_reference}; add the white tarp under this name, "
+        f"give its name as 'white_reference' in {SESSION_INFO_NAME}, add a WHITEREF_NAME or REFLECTANCE_NAME to each "
+        "frame, or process with --calibration.white-source target if a white stands in every frame."
+    )
 
 
 def measure_whites(session: Session, source: WhiteSource, roi: Roi | None, defects: Defects) -> list[White]:

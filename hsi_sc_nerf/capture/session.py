@@ -24,9 +24,8 @@ from hsi_sc_nerf.capture.instrument import (
 )
 from hsi_sc_nerf.capture.session_info import SESSION_INFO_NAME, SessionInfo, read_band_centres, read_session_info
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.spectra import SAME_BAND_NM
 
-# Headers list centres to about 0.01 nm; two captures of one instrument agree to that.
-_SAME_WAVELENGTH_NM = 0.01
 # Words in the name of a white reference that nobody named in session.json.
 _WHITE_WORDS = ("white", "tarp", "spectralon", "panel")
 
@@ -86,7 +85,7 @@ class Session:
     Attributes:
         path: its folder.
         info: content of ``session.json``.
-        white: the capture of the white tarp, if there is one.
+        white: the capture of the white tarp, if there is one. `white_source` says what else there may be.
         frames: the other captures, in natural order of their names.
         image_rotation_deg: rotation of the files' images from upright, counter-clockwise.
         damaged: captures that cannot be used and are left out, by name, with the reason.
@@ -167,9 +166,8 @@ def open_session(path: Path, *, exclude: Collection[str] = (), skip_damaged: boo
         skip_damaged: whether captures that cannot be used are left out (`Session.damaged`) instead of refused.
 
     Raises:
-        InputError: no such folder; fewer than two frames; no white reference for every frame and no finished
-            reflectance of every frame; captures that cannot be opened, or differ from most in shape or bands; or a
-            ``session.json`` that cannot be used.
+        InputError: no such folder; fewer than two frames; captures that cannot be opened, or differ from most in
+            shape or bands; or a ``session.json`` that cannot be used.
 
     Example:
         >>> session = open_session(Path("captures"))
@@ -203,7 +201,6 @@ def open_session(path: Path, *, exclude: Collection[str] = (), skip_damaged: boo
     frames = _consistent(frames, tarp, damaged)
     if damaged and not skip_damaged:
         raise InputError(damaged_captures(path, damaged))
-    _check_whites(path, info, tarp, frames)
     if len(frames) < 2:
         raise InputError(
             f"{path}: has {'a single frame' if frames else 'no frames'} beside the white reference; a reconstruction "
@@ -236,24 +233,6 @@ def damaged_captures(path: Path, damaged: Mapping[str, str]) -> str:
     return (
         f"{path}: {in_short(damaged)} cannot be used; copy the captures again, or leave them out with --skip-damaged."
     )
-
-
-def _check_whites(path: Path, info: SessionInfo, tarp: Capture | None, frames: list[Capture]) -> None:
-    """Require a way to reflectance for every frame: the tarp, its own white, or the instrument's product."""
-    if all(frame.product for frame in frames) or all(frame.has_counts and frame.white for frame in frames):
-        return
-    if tarp is None:
-        raise InputError(
-            f"{path}: has no capture called {info.white_reference}; add the white tarp under this name, give its "
-            f"name as 'white_reference' in {SESSION_INFO_NAME}, or add a WHITEREF_NAME or REFLECTANCE_NAME to each "
-            "frame."
-        )
-    for frame in frames:
-        if not frame.has_counts:
-            raise InputError(
-                f"{frame.cube.header_path}: there are no raw counts of this frame, but of other frames there is "
-                "nothing else; copy its raw cube too, or the REFLECTANCE cube of every frame."
-            )
 
 
 def open_captures(
@@ -335,7 +314,7 @@ def _difference(capture: Capture, usual: Cube, same_size: bool = True) -> str:
     """How a capture's cubes differ from a session's usual cube; empty where they fit."""
     for cube in capture.cubes:
         same_bands = cube.wavelengths_nm.shape == usual.wavelengths_nm.shape and np.allclose(
-            cube.wavelengths_nm, usual.wavelengths_nm, rtol=0.0, atol=_SAME_WAVELENGTH_NM
+            cube.wavelengths_nm, usual.wavelengths_nm, rtol=0.0, atol=SAME_BAND_NM
         )
         if not same_bands:
             return (

@@ -84,18 +84,19 @@ def inspect_session(
         >>> inspection = inspect_session(open_session(Path("captures"), skip_damaged=True))
         >>> refuse_red(inspection.findings)
     """
+    of_white = check_white(session, white_source)  # first: it refuses a session without a white
     quicklooks = quicklooks_of(session)
     markers = find_markers(session, quicklooks)
     session, upright = _upright(session, markers)
     suggested = filled_in(session, markers)
     findings = [
         *check_files(session, skip_damaged),
-        *check_white(session, white_source),
+        *of_white,
         check_dark(session, white_source, {quicklook.name: quicklook.dark_spectrum for quicklook in quicklooks}),
         *check_lines(session, [quicklook.bright_spectra for quicklook in quicklooks], white_source),
         *check_frames(session, quicklooks, markers.detections),
         *check_markers(session, markers),
-        *check_paper(session, quicklooks, markers.detections),
+        *check_paper(session, quicklooks, markers.detections, white_source),
         upright,
         check_scale(session, poses, scale_known),
         *check_angles(session, poses, markers),

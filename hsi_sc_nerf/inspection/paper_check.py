@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Literal
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.calibration.white_source import exposure_ratio, panel_reflectance
+from hsi_sc_nerf.calibration.white_source import WhiteSource, exposure_ratio, panel_reflectance, white_source
 from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.findings import Finding, Level, judged
 from hsi_sc_nerf.inspection.quicklook import PICTURE_NM, Quicklook
@@ -28,12 +29,18 @@ VEIL_AMBER, VEIL_RED = 0.15, 0.2
 """Brightness of the ink relative to the paper; 0.04 to 0.1 for printed black."""
 
 
-def check_paper(session: Session, quicklooks: Sequence[Quicklook], detections: Sequence[Detections]) -> list[Finding]:
+def check_paper(
+    session: Session,
+    quicklooks: Sequence[Quicklook],
+    detections: Sequence[Detections],
+    source: Literal["auto"] | WhiteSource = "auto",
+) -> list[Finding]:
     """The findings ``paper``, where the session's white is a tarp, and ``veil``, where markers are large enough.
 
     Args:
         quicklooks: quicklooks of its frames.
         detections: markers of each frame.
+        source: where the white is.
     """
     if not session.has_counts:
         return []
@@ -49,7 +56,8 @@ def check_paper(session: Session, quicklooks: Sequence[Quicklook], detections: S
     if not found:
         return []
     ink, paper = np.array(found).T
-    of_paper = [] if session.white is None else [_of_paper(session, float(np.median(paper)), len(found))]
+    is_tarp = white_source(session, source) == "tarp"
+    of_paper = [] if not is_tarp else [_of_paper(session, float(np.median(paper)), len(found))]
     # In few and distant markers, blur matters more than stray light.
     if len(found) < len(session.frames):
         return of_paper

@@ -9,10 +9,12 @@ from capture_factory import BANDS, DARK, LAMP, SIZE_PX, WAVELENGTHS_NM, expose, 
 from hsi_sc_nerf.calibration.calibration_checks import check_calibration, check_clipped, check_white
 from hsi_sc_nerf.calibration.lamp_drift import LampDriftEstimate, NotMeasurable
 from hsi_sc_nerf.calibration.noise import NoiseModel
+from hsi_sc_nerf.calibration.reference_checks import check_dark
 from hsi_sc_nerf.calibration.reflectance import PixelCounts
 from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, calibrate_session
 from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.capture.session import open_session
+from hsi_sc_nerf.errors import InputError
 
 
 @pytest.fixture(scope="module")
@@ -260,6 +262,19 @@ def test_a_white_of_each_capture(session, spoilt, expected):
     assert findings["white"].level == expected[0]
     assert expected[1] in ("amber", findings["white-clipped"].level)
     assert levels({finding.name: finding for finding in check_white(own)}) == ("green", "green")
+
+
+def test_a_target_in_the_frames_needs_no_other_white(session):
+    """A tarp that is too dim is not judged."""
+    _, opened = session(0.1 * tarp())
+    alone = replace(opened, white=None)
+    for one in (opened, alone):
+        assert [finding.level for finding in check_white(one, "target")] == ["green"]
+        assert check_dark(one, "target").level == "green"
+    found = calibrate_session(alone, CalibrationConfig(white_source="target", roi=(0, 0, 20, 10)))
+    np.testing.assert_allclose(found.frames[0].gain, 1.0 / (0.6 * LAMP[None]), rtol=1e-3)
+    with pytest.raises(InputError, match=r"no capture called .*--calibration\.white-source target"):
+        check_white(alone)
 
 
 def test_finished_reflectance_needs_no_white(session):

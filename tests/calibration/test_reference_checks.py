@@ -169,9 +169,9 @@ def leaf_session(folder, on_white=1.0, on_frames=1.0):
     return open_session(folder)
 
 
-def line_findings(opened):
+def line_findings(opened, source="auto"):
     frames = [bright_pixels(light_of_some_lines(frame.cube, frame.dark)) for frame in opened.frames]
-    return check_lines(opened, frames)
+    return check_lines(opened, frames, source)
 
 
 def test_materials_and_lamps_that_both_see_have_no_lines(tmp_path):
@@ -191,7 +191,9 @@ def test_a_lamp_that_shone_on_the_frames_only(tmp_path, strength, level):
 
 
 def test_a_lamp_that_shone_on_the_white_only(tmp_path):
-    (finding,) = line_findings(leaf_session(tmp_path, on_white=1.0 + 0.3 * (LINES - 1.0)))
+    opened = leaf_session(tmp_path, on_white=1.0 + 0.3 * (LINES - 1.0))
+    assert line_findings(opened, "target") == []  # a target is in the frames' light
+    (finding,) = line_findings(opened)
     assert finding.level == "red"
     assert "the white only" in finding.sentence
 

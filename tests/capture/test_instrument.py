@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from capture_factory import BANDS, SIZE_PX, WAVELENGTHS_NM
 
+from hsi_sc_nerf.calibration.white_source import white_source
 from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.capture.instrument import read_metadata
 from hsi_sc_nerf.capture.session import open_session
@@ -249,7 +250,7 @@ def test_nothing_to_calibrate_with(tmp_path, of_446):
     two(tmp_path, white=of_446, product=False)
     write_capture(tmp_path, "446", white=False, product=False)
     with pytest.raises(InputError, match=r"no capture called white_reference; .*WHITEREF_NAME or REFLECTANCE_NAME"):
-        open_session(tmp_path)
+        white_source(open_session(tmp_path))
 
 
 def test_a_frame_that_no_white_can_serve(tmp_path):
@@ -257,7 +258,7 @@ def test_a_frame_that_no_white_can_serve(tmp_path):
         write_capture(tmp_path, name, white=False, product=False)
     write_capture(tmp_path, "3", counts=False, white=False)
     with pytest.raises(InputError, match=r"REFLECTANCE_3\.hdr: there are no raw counts"):
-        open_session(tmp_path)
+        white_source(open_session(tmp_path))
 
 
 def test_fingerprint_covers_every_file_that_matters(tmp_path):

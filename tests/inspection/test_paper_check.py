@@ -39,6 +39,13 @@ def test_a_grey_white(session, white, level):
     assert ("too high" in found.sentence) == (level != "green")
 
 
+def test_a_tarp_that_is_not_used_is_not_judged(session):
+    write_white(session, 0.2)
+    findings = inspect_session(open_session(session), white_source="target").findings
+    assert {finding.level for finding in findings if finding.name.startswith("white")} == {"green"}
+    assert "paper" not in [finding.name for finding in findings]
+
+
 def test_a_panel_whose_reflectance_is_known(session):
     write_white(session, 0.5)
     (session / "panel.csv").write_text("wavelength_nm,reflectance\n400,0.5\n1000,0.5\n")
