@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 _SEPARATORS = ";\t"
 """A table with neither of them in its last line is separated by commas."""
+_COMMAS = "between numbers with decimal commas there must be semicolons or tabs; a single column needs decimal points"
 _UNIT = re.compile(r"^(?P<name>.*?)\s*(?:[(\[](?P<brackets>[^)\]]*)[)\]]|/\s*(?P<slash>[^\s/]+))?$")
 _MICROMETRES = ("um", "micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres")
 
@@ -60,7 +61,8 @@ def read_number_table(path: Path, columns: int | None = None, blanks: Collection
     and so are empty columns without a title at the right, which spreadsheets leave.
 
     Args:
-        columns: read so many from the left; the others may hold anything.
+        columns: read so many from the left; the others may hold anything, but not what may be the decimals of these:
+            digits after commas, without titles and without a point in the table.
         blanks: words, in lower case, that stand for no number, as NA does.
 
     Raises:
@@ -86,8 +88,8 @@ def read_number_table(path: Path, columns: int | None = None, blanks: Collection
         ]
     except csv.Error as error:
         raise ValueError(f"its quotation marks are not in pairs: {error}") from error
-    rows = without_empty_columns([[cell.strip() for cell in row[:columns]] for row in rows])
-    titles = () if all(_is_number(cell) for cell in rows[0]) else tuple(rows[0])
+    rows = without_empty_columns([[cell.strip() for cell in row] for row in rows])
+    titles = () if all(_is_number(cell) for cell in rows[0][:columns]) else tuple(rows[0])
     rows, lines = rows[bool(titles) :], [number for number, _ in numbered[bool(titles) :]]
     rows = [["" if cell.lower() in blanks else cell for cell in row] for row in rows]
     width = len(titles or rows[0])
@@ -95,11 +97,15 @@ def read_number_table(path: Path, columns: int | None = None, blanks: Collection
         if len(row) != width:
             raise ValueError(
                 f"its lines do not have the same number of columns: line {number} has {len(row)} and not {width}; "
-                "between numbers with decimal commas there must be semicolons or tabs"
+                f"{_COMMAS}"
             )
-        for cell in row:
+        for cell in row[:columns]:
             if not _is_number(cell):
                 raise ValueError(f"line {number}: {cell!r} is not a number")
+    if columns is not None and width > columns:
+        if separator == "," and not titles and all(cell.isdecimal() for row in rows for cell in row):
+            raise ValueError(f"its commas may separate columns or be decimal marks; {_COMMAS}")
+        titles, rows, width = titles[:columns], [row[:columns] for row in rows], columns
     table = np.array([[number_in(cell) for cell in row] for row in rows], float).reshape(len(rows), width)
     return NumberTable(notes, titles, table, tuple(lines))
 

@@ -7,6 +7,7 @@ from hsi_sc_nerf.analysis.calibrations import read_calibration
 from hsi_sc_nerf.analysis.library import read_library
 from hsi_sc_nerf.calibration.white_source import read_panel
 from hsi_sc_nerf.capture.session_info import read_band_centres
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.number_table import number_in, numbers_in, read_number_table
 from hsi_sc_nerf.simulate.materials import read_spectrum
 
@@ -80,6 +81,20 @@ def test_other_tables_of_the_same_exports(tmp_path):
         np.testing.assert_allclose(read_band_centres(write(tmp_path, text, "utf-8-sig")), [450.5, 460.0])
     spectrum = read_spectrum(write(tmp_path, "Reflectance;Wavelength (nm)\n0,5;390\n0,6;1010\n"))
     assert spectrum.reflectance == (0.5, 0.6)
+
+
+@pytest.mark.parametrize("title", ["", "nm\r\n", "Wellenlänge (nm)\r\n"])
+def test_a_single_column_with_decimal_commas_is_not_cut(tmp_path, title):
+    """As German Excel saves it: nothing tells the commas from those between columns."""
+    with pytest.raises(InputError, match=r"own\.csv: .*decimal commas"):
+        read_band_centres(write(tmp_path, title + "397,32\r\n400,20\r\n403,09\r\n"))
+    quoted = write(tmp_path, title + '"397,32"\r\n"400,20"\r\n"403,09"\r\n')
+    np.testing.assert_allclose(read_band_centres(quoted), [397.32, 400.20, 403.09])
+
+
+@pytest.mark.parametrize("text", ["nm,band\n400,1\n403,2\n", "400,1.5\n403,1.5\n", "400;1\n403;2\n", "400\n403\n"])
+def test_columns_beside_whole_band_centres(tmp_path, text):
+    np.testing.assert_array_equal(read_band_centres(write(tmp_path, text)), [400.0, 403.0])
 
 
 @pytest.mark.parametrize(
