@@ -72,6 +72,13 @@ def same_bands(
     return bands if np.abs(wavelengths_nm[bands] - targets_nm).max() <= SAME_BAND_NM else None
 
 
+def listed_twice(wavelengths_nm: Float[np.ndarray, "bands"]) -> float | None:
+    """The first wavelength that two bands have; None if each band has its own."""
+    ascending = np.sort(wavelengths_nm)
+    twice = ascending[1:][np.diff(ascending) == 0.0]
+    return float(twice[0]) if len(twice) else None
+
+
 def bands_within(
     wavelengths_nm: Float[np.ndarray, "bands"], range_nm: tuple[float, float]
 ) -> Int[np.ndarray, "inside"]:

@@ -126,8 +126,8 @@ def read_panel(path: Path, wavelengths_nm: Float[np.ndarray, "bands"]) -> Float[
     """Reflectance of a panel at the band centres, by linear interpolation.
 
     Each line of the file has a wavelength in nm and a reflectance, in any order of wavelengths; reflectances are
-    percent if any is above 1.5. A header line, empty lines and lines that begin with # are skipped
-    (`read_number_table`). The panel may end one band short of the bands; its outermost value is used there.
+    percent if any is above 1.5. Titles may tell the columns and micrometres (`NumberTable.by_title`). The panel may
+    end one band short of the bands; its outermost value is used there.
 
     Raises:
         InputError: there is no such file, a line is not two numbers, a value is out of range, a wavelength is given
@@ -169,6 +169,10 @@ def _read(path: Path) -> tuple[Float[np.ndarray, "lines"], Float[np.ndarray, "li
     if not whole.all():
         raise InputError(f"{path}: line {table.lines[int(whole.argmin())]} is not two numbers; write {_FORMAT}.")
     panel_nm, reflectance = table.numbers.T
+    columns = table.by_title() if table.titles else {}
+    if len(columns) == 2 and "wavelength_nm" in columns:
+        panel_nm = columns.pop("wavelength_nm")
+        (reflectance,) = columns.values()
     if panel_nm.min() < SHORTEST_NM:
         raise InputError(f"{path}: gives {panel_nm.min():g} as a wavelength; write wavelengths in nm.")
     fractions = reflectance / 100.0 if reflectance.max() > LARGEST_FRACTION else reflectance

@@ -19,7 +19,7 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.capture.envi_header import EnviHeader, read_header
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write
-from hsi_sc_nerf.spectra import covered, nearest_bands
+from hsi_sc_nerf.spectra import covered, listed_twice, nearest_bands
 
 # Order of a cube's axes (lines, samples, bands) in a data file.
 _AXES = {"bil": (0, 2, 1), "bip": (0, 1, 2), "bsq": (2, 0, 1)}
@@ -58,11 +58,11 @@ def open_cube(header: Path | EnviHeader, wavelengths_nm: Float[np.ndarray, "band
 
     Args:
         header: path of the header, or the header itself if it was read before.
-        wavelengths_nm: band centres, used if the header lists none.
+        wavelengths_nm: band centres, used if the header lists none, or one twice because it rounds them.
 
     Raises:
-        InputError: the header cannot be used (`read_header`), there are no wavelengths or no data file, or the data
-            file is shorter or longer than the header says.
+        InputError: the header cannot be used (`read_header`), there are no wavelengths, two bands have the same, or
+            there is no data file, or it is shorter or longer than the header says.
 
     Example:
         >>> cube = open_cube(Path("captures/frame_01.hdr"))
@@ -71,13 +71,21 @@ def open_cube(header: Path | EnviHeader, wavelengths_nm: Float[np.ndarray, "band
     """
     if not isinstance(header, EnviHeader):
         header = read_header(Path(header))
-    if header.wavelengths_nm is not None:
-        wavelengths_nm = header.wavelengths_nm
+    own = header.wavelengths_nm
+    fits = wavelengths_nm is not None and len(wavelengths_nm) == header.shape[2]
+    if own is not None and not (fits and listed_twice(own) is not None):
+        wavelengths_nm = own
     if wavelengths_nm is None or len(wavelengths_nm) != header.shape[2]:
         unfit = "" if wavelengths_nm is None else f", and {len(wavelengths_nm)} band centres do not fit its bands"
         raise InputError(
             f"{header.header_path}: gives no wavelengths{unfit}; add a 'wavelength' list with one number a band, or "
             "name a CSV of the band centres as 'band_centres' in session.json."
+        )
+    twice_nm = listed_twice(wavelengths_nm)
+    if twice_nm is not None:
+        raise InputError(
+            f"{header.header_path}: lists {twice_nm:g} nm twice; give each band its own centre, there or in a CSV "
+            "that session.json names as 'band_centres'."
         )
     data_path = _find_data_file(header)
     actual = data_path.stat().st_size

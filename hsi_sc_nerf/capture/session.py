@@ -24,7 +24,7 @@ from hsi_sc_nerf.capture.instrument import (
 )
 from hsi_sc_nerf.capture.session_info import SESSION_INFO_NAME, SessionInfo, read_band_centres, read_session_info
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.spectra import SAME_BAND_NM
+from hsi_sc_nerf.spectra import SAME_BAND_NM, listed_twice
 
 # Words in the name of a white reference that nobody named in session.json.
 _WHITE_WORDS = ("white", "tarp", "spectralon", "panel")
@@ -240,7 +240,8 @@ def open_captures(
 ) -> list[Capture]:
     """Open captures; those that cannot be opened are added to ``damaged``.
 
-    A header without wavelengths takes those of session.json or of another cube with as many bands.
+    A header without wavelengths, or with equal ones, takes those of session.json or of another cube with as many
+    bands.
     """
     listed = None if info.band_centres is None else read_band_centres(root / info.band_centres)
     headers: dict[str, dict[str, EnviHeader]] = {}
@@ -250,7 +251,7 @@ def open_captures(
     def read_headers(files: CaptureFiles) -> None:
         headers[files.name] = {role: with_band_widths(read_header(path)) for role, path in files.headers.items()}
         for header in headers[files.name].values():
-            if header.wavelengths_nm is not None:
+            if header.wavelengths_nm is not None and listed_twice(header.wavelengths_nm) is None:
                 by_band_count.setdefault(header.shape[2], header.wavelengths_nm)
 
     def open_cubes(files: CaptureFiles) -> None:

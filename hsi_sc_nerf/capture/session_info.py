@@ -15,6 +15,7 @@ from hsi_sc_nerf.errors import InputError, shown
 from hsi_sc_nerf.files import read_json
 from hsi_sc_nerf.number_table import read_number_table
 from hsi_sc_nerf.settings_file import read_dataclass
+from hsi_sc_nerf.spectra import listed_twice
 
 SESSION_INFO_NAME = "session.json"
 _FILES = ("band_centres", "panel_reflectance")
@@ -106,18 +107,22 @@ def read_session_info(path: Path) -> SessionInfo:
 
 
 def read_band_centres(path: Path) -> Float[np.ndarray, "bands"]:
-    """Band centres in nm from the first column of a CSV.
+    """Band centres in nm from the first column of a CSV; its title may say that they are in micrometres.
 
     Raises:
-        InputError: the file cannot be read, or its numbers are no wavelengths in nm.
+        InputError: the file cannot be read, its numbers are no wavelengths, or two are the same.
     """
     try:
-        numbers = read_number_table(path, columns=1).numbers
-        centres_nm = numbers[:, 0] if numbers.size else np.empty(0)
+        table = read_number_table(path, columns=1)
+        first = table.by_title().values() if table.titles else table.numbers.T
+        centres_nm = next(iter(first), np.empty(0))
     except (OSError, ValueError) as error:
         raise InputError(
             f"{path}: is not a list of band centres ({error}); write a line of names and one wavelength in nm a line."
         ) from error
-    if len(centres_nm) == 0 or not (np.isfinite(centres_nm).all() and centres_nm.min() >= 100.0):
+    if len(centres_nm) == 0 or not ((centres_nm >= 100.0) & (centres_nm <= 100_000.0)).all():
         raise InputError(f"{path}: its band centres are not wavelengths in nm; write one number a line, from 100.")
+    twice_nm = listed_twice(centres_nm)
+    if twice_nm is not None:
+        raise InputError(f"{path}: lists {twice_nm:g} nm twice; give each band its own centre.")
     return centres_nm

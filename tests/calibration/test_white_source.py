@@ -23,8 +23,9 @@ def write(folder, text, encoding="utf-8"):
         "# certificate 17\n\nnm\treflectance\r\n500\t97\r\n400\t90\r\n# middle\n450\t95\n",
         "400; 90,0\n450; 95,0\n500; 97,0\n",
         "wavelength (nm), reflectance (fraction)\n  450.0 , 0.95\n5e2,9.7e-1\n400,0.9\n\n",
+        "reflectance;wavelength (µm)\n0,9;0,4\n0,95;0,45\n0,97;0,5\n",
     ],
-    ids=["header", "plain", "percent, tabs, any order", "semicolons, decimal commas", "spaces"],
+    ids=["header", "plain", "percent, tabs, any order", "semicolons, decimal commas", "spaces", "other order, µm"],
 )
 def test_panel_between_its_lines(tmp_path, text):
     for encoding in ("utf-8", "utf-8-sig"):

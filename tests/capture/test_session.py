@@ -198,9 +198,28 @@ def test_wavelengths_of_a_list_beside_session_json(tmp_path):
     assert session.panel_reflectance_path == tmp_path / "panel.csv"
 
 
+def test_wavelengths_that_a_header_rounds_to_equal_ones(tmp_path):
+    rounded = np.where(np.arange(BANDS) == 5, WAVELENGTHS_NM[4], WAVELENGTHS_NM).round()
+    for name in ("a", "b", "white_reference"):
+        write_capture(tmp_path, name, COUNTS, wavelengths_nm=rounded)
+    with pytest.raises(InputError, match=f"lists {rounded[4]:g} nm twice.*band_centres"):
+        open_session(tmp_path)
+    write_cube(tmp_path / "a" / "capture" / "DARKREF_a.hdr", COUNTS, wavelengths_nm=WAVELENGTHS_NM)
+    np.testing.assert_array_equal(open_session(tmp_path).wavelengths_nm, WAVELENGTHS_NM)
+    (tmp_path / "bands.csv").write_text("wavelength (um)\n" + "".join(f"{w / 1000:.6f}\n" for w in WAVELENGTHS_NM))
+    (tmp_path / "session.json").write_text('{"band_centres": "bands.csv"}')
+    write_cube(tmp_path / "a" / "capture" / "DARKREF_a.hdr", COUNTS, wavelengths_nm=rounded)
+    np.testing.assert_allclose(open_session(tmp_path).wavelengths_nm, WAVELENGTHS_NM, atol=1e-3)
+    (tmp_path / "bands.csv").write_text("400\n500\n")
+    with pytest.raises(InputError, match=f"lists {rounded[4]:g} nm twice"):
+        open_session(tmp_path)
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
+        ("wavelength_nm\n400\n500\n400\n", r"bands\.csv: lists 400 nm twice"),
+        ("wavelength (um)\n400\n500\n", r"bands\.csv: its band centres are not wavelengths"),
         ("wavelength_nm\n400\n500\n", "2 band centres do not fit"),
         ("wavelength_nm\nred\n", r"bands\.csv: is not a list of band centres"),
         ("wavelength_nm\n", r"bands\.csv: its band centres are not wavelengths in nm"),
