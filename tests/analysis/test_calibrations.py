@@ -1,6 +1,7 @@
 """Calibrations against scikit-learn's regressions, on simulated spectra."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -93,6 +94,23 @@ def test_spectra_that_the_calibration_does_not_know_have_no_value(fitted):
     assert np.isfinite(calibration.values(inside, only_inside=True)).mean() > 0.9
     assert np.isnan(calibration.values(outside, only_inside=True)).all()
     assert np.isfinite(calibration.values(outside)).all()
+
+
+@pytest.mark.parametrize("scaled", [False, True])
+def test_the_code_of_the_page_writes_limits_that_hold_its_own_spectra(tmp_path, monkeypatch, scaled):
+    page = (Path(__file__).parents[2] / "docs" / "how-to" / "calibrations.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    if scaled:
+        code = code.replace("scale=False", "scale=True").replace("np.ones(101)", "spectra.std(axis=0, ddof=1)")
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    exec(code, names)
+    calibration = read_calibration(tmp_path / "sugar.csv")
+    found = calibration.values(names["spectra"], only_inside=True)
+    assert 0.95 < np.isfinite(found).mean() < 1.0
+    np.testing.assert_allclose(calibration.values(names["spectra"]), names["pls"].predict(names["spectra"]).ravel())
+    strange = names["spectra"].mean(axis=0) + 0.03 * np.sin(names["nm"] / 20.0)
+    assert np.isnan(calibration.values(strange[None], only_inside=True)).all()
 
 
 def test_each_limit_counts_alone(fitted):
