@@ -50,7 +50,8 @@ class Defects:
 
     Attributes:
         saturation_counts: counts from which a reading is saturated; None if nothing saturates.
-        dead: elements that do not follow the light (dead, hot or stuck), outside of the bad bands.
+        dead: elements that do not follow the light (dead, hot or stuck) or have no dark counts, outside of the bad
+            bands.
         bad_bands: bands without measurements: listed as bad, unlit, or with most of their elements dead.
     """
 
@@ -74,6 +75,14 @@ class Readings:
 
     counts: Num[np.ndarray, "lines samples bands"]
     dark: Num[np.ndarray, "dark_lines dark_samples bands"] | None = None
+    """NaN for no data (`dark_counts`)."""
+
+    def without_dark(self) -> Bool[np.ndarray, "samples bands"]:
+        """Elements of which no line of the dark cube has data; none if it cannot be matched by sample."""
+        missing = None if self.dark is None else no_data(np.asarray(self.dark), None)
+        if missing is None or missing.shape[1:] != self.counts.shape[1:]:
+            return np.zeros(self.counts.shape[1:], bool)
+        return np.all(missing, axis=0)
 
     def light(self) -> Float[np.ndarray, "samples bands"]:
         """Mean counts above dark over the lines."""
@@ -100,6 +109,8 @@ def find_defects(
         frame_light = np.mean([readings.light() for readings in frames], axis=0)
         images.append((frame_light, max(readings.resolution() for readings in frames)))
     dead = elements_without_response(images)
+    for readings in (white, *frames):
+        dead |= readings.without_dark()
     bad = unlit_bands(np.where(dead, np.nan, white_light))
     bad |= dead.mean(axis=0) > DEAD_BAND_FRACTION
     if good_bands is not None:
@@ -153,16 +164,35 @@ def unlit_bands(light: Float[np.ndarray, "columns bands"]) -> Bool[np.ndarray, "
     return ~((typical > 0.0) & (typical >= MIN_LIGHT * typical.max()))
 
 
+def dark_counts(dark: Cube | None) -> Num[np.ndarray, "dark_lines dark_samples bands"] | None:
+    """Counts of a dark cube, NaN for no data; None without one."""
+    if dark is None:
+        return None
+    counts = dark.memmap()
+    missing = no_data(counts, dark.ignore_value)
+    return counts if missing is None else np.where(missing, np.nan, counts)
+
+
 def dark_columns(
     dark: Num[np.ndarray, "dark_lines dark_samples bands"] | None, samples: int, bands: int
 ) -> Float[np.ndarray, "columns bands"]:
     """Counts without light of each sample: the mean over the dark cube's lines with data; 0 without a dark cube.
 
-    A dark cube of another width cannot be matched by sample and gives one spectrum (columns = 1).
+    An element without any data has the mean of its band. A dark cube of another width cannot be matched by sample and
+    gives one spectrum (columns = 1).
+
+    Args:
+        dark: NaN for no data (`dark_counts`).
     """
     if dark is None:
         return np.zeros((1, bands))
-    columns = fill_no_data(np.asarray(dark), None).mean(axis=0, dtype=np.float64)
+    counts = np.asarray(dark)
+    columns = fill_no_data(counts, None).mean(axis=0, dtype=np.float64)
+    missing = no_data(counts, None)
+    if missing is not None:
+        unknown = missing.all(axis=0)
+        level = columns.sum(axis=0, where=~unknown) / np.maximum((~unknown).sum(axis=0), 1)
+        columns = np.where(unknown, level, columns)
     return columns if len(columns) == samples else columns.mean(axis=0, keepdims=True)
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Num
 
-from hsi_sc_nerf.calibration.detector import Defects, dark_columns
+from hsi_sc_nerf.calibration.detector import Defects, dark_columns, dark_counts
 from hsi_sc_nerf.calibration.white_reference import TARP_BRIGHTNESS, WhiteReference, mean_over_columns
 from hsi_sc_nerf.capture.session import Capture
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.morphology import dilate, largest_component
-from hsi_sc_nerf.robust_scatter import robust_std
+from hsi_sc_nerf.robust_scatter import robust_std, tukey_weights
 
 ORDER = 4
 """Total order of the surface's polynomial."""
@@ -49,7 +49,7 @@ def flat_field(
     use = np.broadcast_to(~white.bad_bands, (samples, bands))
     if defects is not None:
         use = use & ~defects.dead
-    dark = dark_columns(None if tarp.dark is None else tarp.dark.read(), samples, bands)
+    dark = dark_columns(dark_counts(tarp.dark), samples, bands)
     brightness = relative_brightness(counts, dark, np.nan_to_num(mean_over_columns(white.measured)), use)
     region = np.zeros(brightness.shape, bool)
     x0, y0, x1, y1 = white.roi
@@ -119,5 +119,5 @@ def _robust_fit(terms: Float[np.ndarray, "n terms"], values: Float[np.ndarray, "
         if step < 15:
             weights = 1.0 / np.maximum(distance, 0.1 * scale)
         else:
-            weights = np.clip(1.0 - (distance / (4.685 * scale)) ** 2, 0.0, None) ** 2
+            weights = tukey_weights(distance, scale)
     return coefficients

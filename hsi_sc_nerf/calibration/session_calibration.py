@@ -14,6 +14,7 @@ from hsi_sc_nerf.calibration.detector import (
     Defects,
     Readings,
     dark_columns,
+    dark_counts,
     fill_no_data,
     find_defects,
     no_data,
@@ -249,8 +250,7 @@ def _dark_spectra(captures: Sequence[Capture]) -> list[Float[np.ndarray, "column
     read: dict[Cube | None, Float[np.ndarray, "columns bands"]] = {}
     for capture in captures:
         if capture.dark not in read:
-            counts = None if capture.dark is None else capture.dark.memmap()
-            read[capture.dark] = dark_columns(counts, *capture.cube.shape[1:])
+            read[capture.dark] = dark_columns(dark_counts(capture.dark), *capture.cube.shape[1:])
     return [read[capture.dark] for capture in captures]
 
 
@@ -291,7 +291,7 @@ def _brightest_lines(cube: Cube) -> Int[np.ndarray, "rows"]:
 
 def _readings(cube: Cube, dark: Cube | None, rows: Int[np.ndarray, "rows"]) -> Readings:
     counts = fill_no_data(np.asarray(cube.memmap()[rows]), cube.ignore_value)
-    return Readings(counts, None if dark is None else dark.memmap())
+    return Readings(counts, dark_counts(dark))
 
 
 def _noise(session: Session, source: WhiteSource, white: White, defects: Defects) -> NoiseModel:
@@ -306,7 +306,7 @@ def _noise(session: Session, source: WhiteSource, white: White, defects: Defects
     return measure_noise(
         counts,
         region,
-        None if dark is None else dark.memmap(),
+        dark_counts(dark),
         saturation_counts=defects.saturation_counts,
         dead=defects.dead if same_detector else None,
     )

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Num
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.calibration.detector import Defects, dark_columns, fill_no_data, no_data, unlit_bands
+from hsi_sc_nerf.calibration.detector import Defects, dark_columns, dark_counts, fill_no_data, no_data, unlit_bands
 from hsi_sc_nerf.capture.envi import Cube
 from hsi_sc_nerf.capture.session import Capture
 from hsi_sc_nerf.errors import InputError
@@ -115,7 +115,7 @@ def white_reference(capture: Capture, roi: Roi | None = None, defects: Defects |
             "again or give its place with --calibration.roi."
         )
     readings = ElementSums.of(counts, mask, dead, cube.ignore_value, defects)
-    dark = dark_columns(None if capture.dark is None else capture.dark.read(), samples, bands)
+    dark = dark_columns(dark_counts(capture.dark), samples, bands)
     measured = readings.mean_spectrum(dark if len(dark) == 1 else dark[x0:x1])[None]
     bad_bands = _bad_bands(cube, measured, readings, defects)
     measured = np.where(bad_bands, np.nan, measured)
@@ -146,7 +146,7 @@ def column_white(white: Cube, dark: Cube | None, samples: int, defects: Defects 
     width, bands = counts.shape[1:]
     everywhere = np.ones(counts.shape[:2], bool)
     readings = ElementSums.of(counts, everywhere, _dead(defects, width, bands), white.ignore_value, defects)
-    dark_spectra = dark_columns(None if dark is None else dark.read(), width, bands)
+    dark_spectra = dark_columns(dark_counts(dark), width, bands)
     if width == samples:
         with np.errstate(invalid="ignore"):
             measured = readings.sums / readings.numbers - dark_spectra

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calibration_score import CalibrationScore, score_calibration
-from capture_factory import BANDS, SIZE_PX, expose, write_capture, write_session
+from capture_factory import BANDS, DARK, LAMP, SIZE_PX, WAVELENGTHS_NM, expose, write_capture, write_session
 
 from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, SessionCalibration, calibrate_session
 from hsi_sc_nerf.capture.envi import Cube, open_cube, write_cube
@@ -265,3 +265,19 @@ def test_a_panel_that_is_no_perfect_white(tiny, tmp_path):
     panel = calibrate_session(replace(tiny, info=info), CalibrationConfig())
     expected = np.interp(tiny.wavelengths_nm, [350.0, 1050.0], [0.9, 0.8])
     np.testing.assert_allclose(panel.frames[0].gain / perfect.frames[0].gain, expected[None], rtol=1e-12)
+
+
+@pytest.mark.parametrize("gap", [np.nan, 0])
+def test_an_element_without_dark_counts_is_dead_and_not_without_an_offset(tmp_path, gap):
+    dtype, ignored = (np.float32, {}) if np.isnan(gap) else (np.uint16, {"data ignore value": 0})
+    dark = np.full((2, SIZE_PX, BANDS), DARK, dtype)
+    dark[:, 5, 2] = gap
+    dark[0, 7, 3] = gap  # one line has data
+    dark[..., 9] = gap
+    for header in [*write_session(tmp_path).rglob("DARKREF_*.hdr")]:
+        write_cube(header, dark, wavelengths_nm=WAVELENGTHS_NM, extra_header=ignored)
+    found = calibrate_session(open_session(tmp_path), CalibrationConfig())
+    assert np.argwhere(found.defects.dead).tolist() == [[5, 2]]
+    assert found.bands.tolist() == [band for band in range(BANDS) if band != 9]
+    np.testing.assert_allclose(found.frames[0].dark[:, found.bands], DARK)
+    np.testing.assert_allclose(found.frames[0].gain[0, found.bands], 1.0 / LAMP[found.bands], rtol=1e-3)
