@@ -284,7 +284,10 @@ def check_clipped(session: Session, calibration: SessionCalibration, counts: Pix
     if clipped > CLIPPED_RED or by_band[worst] > SATURATED_RED:
         return Finding("clipped", "red", f"{session.path}: {text}; check the white and the integration time.", values)
     if clipped > CLIPPED_AMBER or by_band[worst] > SATURATED_AMBER:
-        return Finding("clipped", "amber", f"{session.path}: {text}; a shorter integration time avoids it.", values)
+        advice = "a shorter integration time avoids it"
+        if not by_band[worst] > SATURATED_AMBER:  # clipped readings are not saturated, and as bright by any exposure
+            advice = "check the white, or raise the upper bound with --calibration.bounds"
+        return Finding("clipped", "amber", f"{session.path}: {text}; {advice}.", values)
     return Finding("clipped", "green", f"Values: {text}.", values)
 
 

@@ -62,8 +62,9 @@ class CalibrationConfig:
     frame at --calibration.roi (target). Product takes the instrument's own REFLECTANCE cubes and needs no white. Auto
     takes the first of tarp, capture and product that the session has."""
     roi: tuple[int, int, int, int] | None = between(0, 10**6, default=None)
-    """Region of the white in the image as the file holds it: x0 y0 x1 y1 in pixels, x1 and y1 excluded. By default, a
-    tarp is found by its brightness; a white target needs this."""
+    """Region of the white in the stored file: x0 y0 x1 y1 in pixels, x counts samples, y counts lines, x1 and y1
+    excluded. The pictures of `inspect` may be turned against it by image_rotation_deg. By default, a tarp is found by
+    its brightness; a white target needs this."""
     bounds: tuple[float, float] = between(-100.0, 100.0, default=paper.REFLECTANCE_BOUNDS)
     """Reflectance is clipped to this range."""
     flat_field: bool = False

@@ -89,12 +89,12 @@ def read_header(path: Path, library: bool = False) -> EnviHeader:
             or the header describes a library where an image is expected, or the converse.
     """
     fields = _mended_fields(path)
-    try:
-        shape = (int(fields["lines"]), int(fields["samples"]), 1 if library else int(fields["bands"]))
-        offset = int(fields.get("header offset") or 0)
-        dtype = np.dtype(envi.envi_to_dtype[fields["data type"]])
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: a field of this header cannot be read ({error}); correct it.") from error
+    lines, samples = _whole(path, fields, "lines"), _whole(path, fields, "samples")
+    shape = (lines, samples, 1 if library else _whole(path, fields, "bands"))
+    offset = _whole(path, fields, "header offset")
+    if str(fields["data type"]) not in envi.envi_to_dtype:
+        raise InputError(f"{path}: data type is {str(fields['data type'])!r}, which ENVI does not have; correct it.")
+    dtype = np.dtype(envi.envi_to_dtype[str(fields["data type"])])
     _check_layout(path, fields, shape, dtype, offset, library)
     is_library = "library" in str(fields.get("file type", "")).lower()
     if is_library and not library:
@@ -183,6 +183,15 @@ def _check_layout(
             raise InputError(f"{path}: has {key}, which are not supported; export the cube without them.")
 
 
+def _whole(path: Path, fields: dict[str, Any], key: str) -> int:
+    """A field's whole number; 0 where the field is missing or empty."""
+    value = str(fields.get(key) or 0)
+    try:
+        return int(value)
+    except ValueError as error:
+        raise InputError(f"{path}: {key} is {value!r}, which is not a whole number; correct it.") from error
+
+
 def _number(path: Path, fields: dict[str, Any], key: str) -> float | None:
     """A field's number; None where the field is missing or empty."""
     numbers = _numbers(path, {key: np.atleast_1d(fields.get(key, ""))[0]}, key, 1)
@@ -194,15 +203,25 @@ def _numbers(path: Path, fields: dict[str, Any], key: str, count: int) -> Float[
     listed = fields.get(key, "")
     if listed in ("", [""]):
         return None
-    try:
-        numbers = np.array([float(value) for value in np.atleast_1d(listed)])
-    except ValueError as error:
-        raise InputError(f"{path}: {key} holds what is not a number ({error}); correct it.") from error
+    values = [str(value) for value in np.atleast_1d(listed)]
+    for value in values:
+        if not _is_number(value):
+            does = "lists" if count > 1 else "is"
+            raise InputError(f"{path}: {key} {does} {value!r}, which is not a number; write the number alone.")
+    numbers = np.array([float(value) for value in values])
     if len(numbers) != count:
         raise InputError(f"{path}: {key} lists {len(numbers)} numbers for {count} bands; correct the list.")
     if count > 1 and (not np.isfinite(numbers).all() or numbers.min() < 0.0):
         raise InputError(f"{path}: {key} holds numbers that are negative or not finite; correct the list.")
     return numbers
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _wavelengths(path: Path, fields: dict[str, Any], bands: int) -> tuple[float, Float[np.ndarray, "bands"] | None]:
