@@ -77,7 +77,9 @@ def do_step(folder, name, step):
     status = 1
     try:
         os.chdir(folder)
-        record_step(read_plan(Path.cwd())[name], step, run_here)
+        planned = read_plan(Path.cwd())[name]
+        os.chdir(planned.caller)
+        record_step(planned, step, run_here)
         status = 0
     except BaseException:
         traceback.print_exc()

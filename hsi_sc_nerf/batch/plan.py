@@ -18,6 +18,8 @@ from hsi_sc_nerf.models.presets import Preset
 LIST_NAME, SETTINGS_NAME, OBJECTS_NAME = "sessions.csv", "settings.json", "objects"
 STEPS = ("inspect", "process", "train", "evaluate", "export", "material", "traits", "report")
 """The steps of an object, in order."""
+_CALLER = "folder"
+"""Key of the folder that the batch was started in, beside the settings."""
 _AGAIN = "start `hsi-sc-nerf batch` again"
 
 
@@ -29,19 +31,22 @@ class PlannedObject:
         session: folder of its captures.
         folder: folder of its results.
         settings: settings of its steps.
+        caller: folder that the batch was started in, where relative paths in the words start.
     """
 
     session: Path
     folder: Path
     settings: SessionSettings
+    caller: Path
 
     def step(self, name: str) -> Step:
         """The command of a step, as things stand in the folder."""
         if name == "inspect":
-            words = ("hsi-sc-nerf", "inspect", str(self.session), "--output-dir", str(self.folder))
+            words = ("hsi-sc-nerf", "inspect", self.session, "--output-dir", self.folder)
             # What is red there may have been accepted for `process`, which makes the same checks and decides.
             return Step(name, words, (self.session,), (self.folder / INSPECTION_NAME,))
-        return {step.name: step for step in session_steps(self.session, self.folder, self.settings)}[name]
+        steps = session_steps(self.session, self.folder, self.settings, self.caller)
+        return {step.name: step for step in steps}[name]
 
     def record(self, step: str) -> Path:
         """The file that says how a step ended."""
@@ -67,7 +72,7 @@ def write_plan(out: Path, rows: Sequence[Row], settings: SessionSettings, kept: 
     kept = out if kept is None else kept
     make_folder(kept)
     # The settings first: a list without them is not of a batch.
-    write_json(kept / SETTINGS_NAME, asdict(settings))
+    write_json(kept / SETTINGS_NAME, asdict(settings) | {_CALLER: str(Path.cwd())})
     table = sessions_table(rows)
     path = kept / LIST_NAME
     if not path.is_file() or path.read_text(encoding="utf-8") != table:
@@ -90,15 +95,16 @@ def read_plan(out: Path, kept: Path | None = None) -> dict[str, PlannedObject]:
         ('hsi-sc-nerf', 'process')
     """
     kept = out if kept is None else kept
-    known: Mapping[str, Any] = read_json(kept / SETTINGS_NAME, _AGAIN)
+    known: dict[str, Any] = read_json(kept / SETTINGS_NAME, _AGAIN)
     try:
+        caller = Path(known.pop(_CALLER, out))
         settings = SessionSettings(**known)
         _check_types(settings)
     except TypeError as error:
         raise InputError(f"{kept / SETTINGS_NAME}: are no settings of a batch; {_AGAIN}.") from error
     root = out.resolve() / OBJECTS_NAME
     return {
-        row[OBJECT]: PlannedObject(Path(row[SESSION]), root / row[OBJECT], _settings_of(row, settings))
+        row[OBJECT]: PlannedObject(Path(row[SESSION]), root / row[OBJECT], _settings_of(row, settings), caller)
         for row in read_sessions(kept / LIST_NAME, may_be_gone=True)
     }
 

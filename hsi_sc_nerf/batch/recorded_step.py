@@ -67,6 +67,14 @@ def record_step(one: PlannedObject, name: str, run_step: StepRunner) -> None:
     _write(one, name, status, sentence, cost)
 
 
+def runner_of(one: PlannedObject) -> StepRunner:
+    """Runs commands in the folder that the batch was started in, where the user's words were checked.
+
+    A pod need not have that folder; words for it hold absolute paths.
+    """
+    return partial(run_step, errors=subprocess.STDOUT, folder=one.caller if one.caller.is_dir() else None)
+
+
 def copy_record(one: PlannedObject, name: str, copy: Path) -> None:
     """Copy a step's record to where Snakemake looks for it; its own place is left as it is."""
     if copy.resolve() != one.record(name).resolve():
@@ -101,6 +109,6 @@ if __name__ == "__main__":
     # Snakemake that is killed leaves its jobs; started again, it would have two of them write to one folder.
     end_with_parent()
     planned = read_plan(Path.cwd())[sys.argv[1]]
-    record_step(planned, sys.argv[2], partial(run_step, errors=subprocess.STDOUT))
+    record_step(planned, sys.argv[2], runner_of(planned))
     for path in sys.argv[3:]:
         copy_record(planned, sys.argv[2], Path(path))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 import shlex
 import shutil
 from collections.abc import Callable, Sequence
@@ -29,6 +30,8 @@ MATERIAL_NAME = "point_cloud-material.json"
 """File of the output folder that says what was decided of the light on the object."""
 OPTIONAL_STEPS = ("inspect", "material")
 """Where one of these fails, the others do without."""
+_DATASET_NAME = "transforms.json"
+"""The file of a dataset that tells of its frames."""
 StepRunner = Callable[[str, Sequence[str], Path], StepCost]
 """Runs a command; gets the step's name, the command and the file for its output."""
 
@@ -39,13 +42,13 @@ class Step:
 
     Attributes:
         name: shown, and the name of the log.
-        words: the command as a user would type it.
+        words: the command as a user would type it; the run's own paths are `Path`, the user's words text.
         inputs: files and folders that its results depend on.
         outputs: files that it leaves.
     """
 
     name: str
-    words: tuple[str, ...]
+    words: tuple[str | Path, ...]
     inputs: tuple[Path, ...]
     outputs: tuple[Path, ...]
 
@@ -57,14 +60,19 @@ class Step:
     def fingerprint(self, outside: Path) -> str:
         """Hash of command, version, and sizes and times of the inputs but for those in the folder ``outside``.
 
-        An input that lies in that folder itself is a result of an earlier step, and counts.
+        An input that lies in that folder itself is a result of an earlier step, and counts. It is the same from
+        whatever folder the command is called, and after session and results were moved.
         """
-        digest = hashlib.sha256(json.dumps([__version__, self.words]).encode())
-        for path in self.inputs:
+        outside = outside.resolve()
+        words = [_within(outside, word) if isinstance(word, Path) else word for word in self.words]
+        digest = hashlib.sha256(json.dumps([__version__, words]).encode())
+        for path in map(Path.resolve, self.inputs):
+            inside = outside in path.parents
+            root = outside if inside else path if path.is_dir() else path.parent
             for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
-                if file.is_file() and (outside in path.parents or outside not in file.parents):
+                if file.is_file() and (inside or outside not in file.parents):
                     state = file.stat()
-                    digest.update(f"{file} {state.st_size} {state.st_mtime_ns}\n".encode())
+                    digest.update(f"{file.relative_to(root)} {state.st_size} {state.st_mtime_ns}\n".encode())
         return digest.hexdigest()
 
     def was_tried(self, out: Path) -> bool:
@@ -98,24 +106,28 @@ class SessionSettings:
     """More words for `hsi-sc-nerf traits`, likewise: --traits="--index PRI --index CRI1"."""
 
 
-def session_steps(session: Path, out: Path, settings: SessionSettings) -> list[Step]:
+def session_steps(session: Path, out: Path, settings: SessionSettings, folder: Path = Path()) -> list[Step]:
     """The commands from a session to its report, in order.
 
     Args:
         session: folder of the captures.
         out: folder for all results. The traits are of the cloud that the material's step leaves there, or not.
         settings: what the user chose.
+        folder: that relative paths in the user's words start from.
 
     Example:
         >>> [step.name for step in session_steps(Path("session"), Path("out"), SessionSettings())][:3]
         ['process', 'train', 'evaluate']
     """
+    named = {
+        name: _named_files(getattr(settings, name), folder) for name in ("process", "train", "material", "traits")
+    }
     data, cloud, traits = out / "data", out / "point_cloud.ply", out / "traits"
     material = out / "point_cloud-material.ply"
     with_material = material if material.is_file() else cloud
     run = out / "training" / "hsi-sc-nerf" / "run"
     config, weights = run / "config.yml", run / "nerfstudio_models"
-    packed = data / "transforms.json"
+    packed = data / _DATASET_NAME
     training = ["ns-train", "hsi-sc-nerf", "--data", data, "--output-dir", out, "--experiment-name", "training"]
     training += ["--timestamp", "run", "--vis", "tensorboard", "--preset", settings.preset]
     if settings.max_num_iterations is not None:
@@ -129,22 +141,22 @@ def session_steps(session: Path, out: Path, settings: SessionSettings) -> list[S
         (
             "process",
             ["hsi-sc-nerf", "process", session, "--output-dir", data, *split_words(settings.process)],
-            (session,),
+            (session, *named["process"]),
             (packed,),
         ),
-        ("train", [*training, *split_words(settings.train)], (packed, data / "masks"), (config,)),
+        ("train", [*training, *split_words(settings.train)], (packed, data / "masks", *named["train"]), (config,)),
         ("evaluate", evaluating, (packed, weights), (out / "eval.json",)),
         ("export", exporting, (packed, weights), (cloud,)),
         (
             "material",
             ["hsi-sc-nerf", "material", cloud, "--load-config", config, *split_words(settings.material)],
-            (packed, weights, cloud),
+            (packed, weights, cloud, *named["material"]),
             (material, out / MATERIAL_NAME),
         ),
         (
             "traits",
             [*measuring, *split_words(settings.traits)],
-            (packed, with_material),
+            (packed, with_material, *named["traits"]),
             (traits / "traits.json",),
         ),
         (
@@ -154,7 +166,10 @@ def session_steps(session: Path, out: Path, settings: SessionSettings) -> list[S
             (out / "report.html",),
         ),
     ]
-    return [Step(name, tuple(map(str, words)), inputs, outputs) for name, words, inputs, outputs in table]
+    return [
+        Step(name, tuple(word if isinstance(word, Path) else str(word) for word in words), inputs, outputs)
+        for name, words, inputs, outputs in table
+    ]
 
 
 def is_up_to_date(step: Step, out: Path) -> bool:
@@ -184,16 +199,17 @@ def bring_up_to_date(step: Step, out: Path, console: Console, title: str, run_st
     if _is_finished(step, before, fingerprint):
         console.print(f"{title}: up to date")
         return _cost(step.name, before)
-    words = [*step.words]
+    words: list[str | Path] = [*step.words]
     same = before.get("fingerprint") == fingerprint
     run = step.outputs[0].parent
     if step.name == "train":
         if not same:
             shutil.rmtree(run, ignore_errors=True)
         elif any(run.glob("nerfstudio_models/*.ckpt")):
-            words += ["--load-dir", str(run / "nerfstudio_models")]
-    console.print(f"{title}\n{escape(shlex.join(words))}")
-    entry: dict[str, Any] = {"command": shlex.join(step.words), "fingerprint": fingerprint, "finished": False}
+            words += ["--load-dir", run / "nerfstudio_models"]
+    console.print(f"{title}\n{escape(shlex.join(map(str, words)))}")
+    command = shlex.join(map(str, step.words))
+    entry: dict[str, Any] = {"command": command, "fingerprint": fingerprint, "finished": False}
     write_json(out / STEPS_NAME, done | {step.name: entry})
     logs = out / "logs"
     make_folder(logs)
@@ -206,6 +222,19 @@ def bring_up_to_date(step: Step, out: Path, console: Console, title: str, run_st
         raise InputError(f"{missing[0]}: was not written by the step '{step.name}'; its log is in {logs}.")
     write_json(out / STEPS_NAME, done | {step.name: entry | {"finished": True}})
     return _cost(step.name, entry)
+
+
+def _named_files(text: str, folder: Path) -> list[Path]:
+    """Files that the user's words name, also behind an equals sign; of a dataset's folder ``transforms.json``."""
+    named = [folder / value for word in split_words(text) for value in (word, word.partition("=")[2]) if value]
+    # `os.path` takes names that are too long for a file, such as formulas.
+    return [path for one in named for path in (one, one / _DATASET_NAME) if os.path.isfile(path)]
+
+
+def _within(folder: Path, path: Path) -> str:
+    """A path as it lies in the folder; of the session, which lies elsewhere, the files count and not the place."""
+    path = path.resolve()
+    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else ""
 
 
 def _is_finished(step: Step, entry: dict[str, Any], fingerprint: str) -> bool:

@@ -40,7 +40,9 @@ class StepCost:
     peak_memory_mib: float
 
 
-def run_step(name: str, argv: Sequence[str], log: Path, errors: int | None = None) -> StepCost:
+def run_step(
+    name: str, argv: Sequence[str], log: Path, errors: int | None = None, folder: Path | None = None
+) -> StepCost:
     """Run a command in a process of its own.
 
     Args:
@@ -48,6 +50,7 @@ def run_step(name: str, argv: Sequence[str], log: Path, errors: int | None = Non
         argv: command; its progress bars appear on the terminal.
         log: file for its standard output.
         errors: `subprocess.STDOUT` where errors and progress go there as well.
+        folder: to run it in; by default the working folder.
 
     Raises:
         InputError: the command failed; the message names its log.
@@ -62,7 +65,9 @@ def run_step(name: str, argv: Sequence[str], log: Path, errors: int | None = Non
     with log.open("wb") as output:
         # A step that outlives its run would write into the folder of the next one.
         orphans = end_with_parent if sys.platform == "linux" else None
-        process = subprocess.Popen(list(argv), stdout=output, stderr=errors, env=environment, preexec_fn=orphans)
+        process = subprocess.Popen(
+            list(argv), stdout=output, stderr=errors, env=environment, preexec_fn=orphans, cwd=folder
+        )
         try:
             _, status, usage = os.wait4(process.pid, 0)
         except BaseException:

@@ -199,16 +199,22 @@ def _snakemake(words: list[str]) -> int:
 
 
 def _show_failures(out: Path) -> None:
-    """Print the sentence of each object that failed, and how many are done."""
+    """Print the sentence of each step that failed, and how many objects are done."""
     console = Console(highlight=False, soft_wrap=True)
     plan, done = read_plan(out), 0
     for name, one in plan.items():
+        failed = {}
         for step in STEPS:
             path = one.record(step)
             record = read_json(path, "delete it and start again") if path.is_file() else {}
             done += step == STEPS[-1] and record.get("status") == "done"
-            if record.get("status") == "failed" and one.step(step).needed:
-                console.print(f"[yellow]{escape(name)}, {step}: {escape(record['sentence'])}")
+            if record.get("status") == "failed":
+                failed[step] = record["sentence"]
+        needed = {step: sentence for step, sentence in failed.items() if one.step(step).needed}
+        # What `inspect` cannot read, `process` cannot either: one sentence is enough.
+        for step, sentence in (needed or failed).items():
+            without = "" if needed else " The other steps do without."
+            console.print(f"[yellow]{escape(name)}, {step}: {escape(sentence)}{without}")
     console.print(f"{done} of {len(plan)} objects are done.", style="bold")
 
 

@@ -1,6 +1,7 @@
 """Whatever happens to a session, its records say it; and what is to be made again."""
 
 import json
+import sys
 from functools import partial
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import pytest
 from quick_steps import quick_run
 
 from hsi_sc_nerf.batch.plan import INSPECTION_NAME, STEPS, outdated, read_plan, write_plan
-from hsi_sc_nerf.batch.recorded_step import copy_record, record_step
+from hsi_sc_nerf.batch.recorded_step import copy_record, record_step, runner_of
 from hsi_sc_nerf.batch.session_steps import SessionSettings
 from hsi_sc_nerf.cli import sessions
 from hsi_sc_nerf.errors import InputError
@@ -51,6 +52,30 @@ def test_the_inspection_has_its_name(planned):
 def test_words_of_a_row_come_after_those_of_the_batch(planned):
     plan = planned(train="--all 2", preset="fast")
     assert plan["pear"].step("train").words[-5:] == ("fast", "--all", "2", "--own", "1")
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_step_runs_where_the_batch_was_called(planned, tmp_path, monkeypatch, there):
+    """Relative paths in the user's words were checked there; on a pod, that folder can be missing."""
+    (tmp_path / "caller").mkdir()
+    monkeypatch.chdir(tmp_path / "caller")
+    planned()
+    monkeypatch.chdir(tmp_path)
+    if not there:
+        (tmp_path / "caller").rmdir()
+    one = read_plan(tmp_path)["pear"]
+    code = "import pathlib; print(pathlib.Path.cwd())"
+    runner_of(one)("process", [sys.executable, "-c", code], tmp_path / "log.txt")
+    assert (tmp_path / "log.txt").read_text().strip() == str(one.caller if there else tmp_path)
+    assert one.caller == tmp_path / "caller"
+
+
+def test_a_file_that_words_name_is_looked_for_where_the_batch_was_called(planned, tmp_path, monkeypatch):
+    (tmp_path / "skin.csv").write_text("1")
+    do(planned(traits="--library skin.csv")["pear"])
+    (tmp_path / "skin.csv").write_text("22")
+    monkeypatch.chdir(tmp_path / "objects")
+    assert [path.stem for path in outdated(read_plan(tmp_path), False)] == ["traits"]
 
 
 @pytest.mark.parametrize(("key", "value", "told"), [("preset", "slow", "'slow' is none"), ("train", "'", "split")])

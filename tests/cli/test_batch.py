@@ -15,10 +15,11 @@ from pathlib import Path
 import pytest
 from quick_steps import quick_snakefile
 
-from hsi_sc_nerf.batch.plan import STEPS
+from hsi_sc_nerf.batch.plan import STEPS, read_plan
 from hsi_sc_nerf.cli import batch
 from hsi_sc_nerf.cli.batch import SNAKEFILE, BatchCommand
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import write_json
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "batch.md"
 START = "from hsi_sc_nerf.cli import batch, main; batch.SNAKEFILE = batch.Path({!r}); main.main()"
@@ -128,6 +129,26 @@ def test_two_started_at_once_do_not_harm_each_other(tmp_path, monkeypatch, comma
     assert refused == [True, True, True]
     assert "first" in (out / "sessions.csv").read_text()
     assert not list(out.rglob("*.lock"))
+
+
+def test_at_the_end_stands_what_failed_and_an_optional_step_where_nothing_else_did(
+    tmp_path, monkeypatch, command, capsys
+):
+    make_sessions(tmp_path / "sessions", ["apple", "pear"])
+    failed = {"apple": ["material"], "pear": ["inspect", "process"]}
+
+    def snakemake(given):
+        for name, one in read_plan(tmp_path / "out").items():
+            for step in STEPS:
+                status = "failed" if step in failed[name] else "done"
+                write_json(one.record(step), {"status": status, "sentence": f"the {step} of the {name} failed."})
+        return 0
+
+    monkeypatch.setattr(batch, "_snakemake", snakemake)
+    assert command(*words(tmp_path)) == 0
+    told = capsys.readouterr().out
+    assert [line.split(":")[0] for line in told.splitlines()[:-1]] == ["apple, material", "pear, process"]
+    assert "the material of the apple failed." in told
 
 
 def test_a_full_disk_leaves_no_lock(tmp_path, limit_of_files):
