@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import yaml
@@ -9,7 +10,9 @@ import yaml
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.dataset import transforms_path
 
-_KEYS = ("pipeline", "datamanager", "data")
+_DATA_KEYS, _OUTPUT_KEYS = ("pipeline", "datamanager", "data"), ("output_dir",)
+_DEPTH = 3
+"""Folders from ``--output-dir`` to ``config.yml``: experiment, method and time."""
 
 
 def require_dataset_of_run(load_config: Path) -> None:
@@ -20,7 +23,7 @@ def require_dataset_of_run(load_config: Path) -> None:
     Raises:
         InputError: the dataset is not there.
     """
-    named = _named_dataset(load_config)
+    named = _named_path(load_config, _DATA_KEYS)
     if named is not None and find_dataset(named, load_config) is None:
         raise InputError(
             f"{load_config}: was trained on the packed dataset {named}, which is not there; put it back, or call the "
@@ -32,23 +35,28 @@ def find_dataset(named: Path, load_config: Path) -> Path | None:
     """Where a run's dataset lies now, None if it is not there.
 
     A relative path is that of the folder in which the training was started: it is looked for from the working folder,
-    then from the run's folder upwards.
+    then from the run's folder upwards. With an absolute path, run and dataset may have been moved together.
 
     Args:
         named: path of the dataset in the run's settings.
         load_config: the run's ``config.yml``.
     """
-    candidates = (named, *(folder / named for folder in load_config.resolve().parents))
+    folders = load_config.resolve().parents
+    candidates = [named, *(folder / named for folder in folders)]
+    before = _named_path(load_config, _OUTPUT_KEYS)
+    if named.is_absolute() and before is not None and before.is_absolute() and len(folders) > _DEPTH:
+        candidates.append(folders[_DEPTH] / os.path.relpath(named, before))
     return next((path for path in candidates if transforms_path(path).is_file()), None)
 
 
-def _named_dataset(load_config: Path) -> Path | None:
+def _named_path(load_config: Path, keys: tuple[str, ...]) -> Path | None:
+    """A path in a run's settings, by the keys that lead to it; None where there is none."""
     try:
         # Nodes alone: nothing that the file names is made or called.
         node = yaml.compose(load_config.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError):
         return None
-    for key in _KEYS:
+    for key in keys:
         if not isinstance(node, yaml.MappingNode):
             return None
         node = next((value for name, value in node.value if name.value == key), None)

@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.packed.of_run import require_dataset_of_run
+from hsi_sc_nerf.packed.of_run import find_dataset, require_dataset_of_run
 
 
 @pytest.fixture
@@ -24,6 +24,24 @@ def test_a_dataset_is_looked_for_from_the_runs_folder_upwards(config, tmp_path):
     (tmp_path / "pear-data").mkdir()
     (tmp_path / "pear-data" / "transforms.json").write_text("{}")
     require_dataset_of_run(config)
+
+
+@pytest.mark.parametrize("data", ["data", "../data"])
+def test_a_dataset_with_an_absolute_path_is_found_where_it_was_moved_with_the_run(tmp_path, data):
+    """Of a name alone it is not: another dataset can have it."""
+    before, now = tmp_path / "old" / "pear", tmp_path / "new" / "pear_01"
+    named = (before / data).resolve()
+    path = now / "training" / "hsi-sc-nerf" / "run" / "config.yml"
+    path.parent.mkdir(parents=True)
+    settings = {"output_dir": before, "pipeline": {"datamanager": {"data": named}}}
+    path.write_text(yaml.dump(settings))
+    for place in (tmp_path / "data", now / data):
+        with pytest.raises(InputError, match="which is not there"):
+            require_dataset_of_run(path)
+        place.mkdir()
+        (place / "transforms.json").write_text("{}")
+    require_dataset_of_run(path)
+    assert find_dataset(named, path).resolve() == (now / data).resolve()
 
 
 @pytest.mark.parametrize("text", ["", "[]", "pipeline: 3", "pipeline: {datamanager: {data: null}}", "a: [", "\x00"])
