@@ -123,11 +123,18 @@ def outdated(objects: Mapping[str, PlannedObject], retry: bool) -> list[Path]:
                 continue
             status = read_json(one.record(name), f"delete it and {_AGAIN}").get("status")
             step = one.step(name)
-            if status == "done" and not is_up_to_date(step, one.folder):
+            if status == "done" and not _has_results(step, one.folder):
                 found.append(one.record(name))
             if status == "failed" and (retry or not step.was_tried(one.folder)):
                 found.append(one.record(name))
     return found
+
+
+def _has_results(step: Step, folder: Path) -> bool:
+    """Whether results of the same command and inputs are there; `inspect` that found something red has them too."""
+    if step.name == "inspect":
+        return step.was_tried(folder) and step.outputs[0].is_file()
+    return is_up_to_date(step, folder)
 
 
 def unlisted(out: Path, rows: Sequence[Row]) -> list[str]:

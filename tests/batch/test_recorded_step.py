@@ -183,8 +183,31 @@ def test_what_is_red_is_left_to_process_which_may_accept_it(planned, opened):
     do(one, ["inspect"], run)
     record = json.loads(one.record("inspect").read_text())
     assert (record["status"], record["sentence"]) == ("done" if opened else "failed", "no markers are seen.")
+    assert forced(planned()) == []
     do(one, ["process"])
     assert json.loads(one.record("process").read_text())["status"] == "done"
+    (one.session / "new.raw").write_text("counts")
+    assert forced(planned()) == ["inspect", "process"]
+
+
+@pytest.mark.parametrize("left", ["killed", "removed"])
+def test_a_red_inspection_without_its_result_is_made_again(planned, left):
+    one = planned()["pear"]
+
+    def run(name, argv, log):
+        quick_run(one, name, argv, log)
+        raise InputError("no markers are seen.")
+
+    def killed(name, argv, log):
+        raise KeyboardInterrupt
+
+    do(one, ["inspect"], run)
+    if left == "killed":
+        with pytest.raises(KeyboardInterrupt):
+            do(one, ["inspect"], killed)
+    else:
+        (one.folder / INSPECTION_NAME).unlink()
+    assert forced(planned()) == ["inspect"]
 
 
 def test_a_pod_copies_the_record_to_where_snakemake_looks_for_it(planned, tmp_path):
