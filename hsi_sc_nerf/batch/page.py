@@ -156,6 +156,6 @@ def _payload(table: BatchTable, out: Path, done: Callable[[int], None] | None) -
 
 def _label(column: Column) -> str:
     """The column's name for the eye: of the list of sessions as it is, of ours without its unit."""
-    if column.group == "list" or not column.unit:
-        return column.name if column.group == "list" else column.name.replace("_", " ")
-    return column.name.rpartition("_")[0].replace("_", " ")
+    if column.group == "list":
+        return column.name
+    return column.name.removesuffix(columns.safe_name("x", unit=column.unit)[1:]).replace("_", " ")

@@ -5,6 +5,7 @@ import csv
 import io
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlparse
 from urllib.request import url2pathname
@@ -15,6 +16,7 @@ from batch_folder import traits_of, write_object, write_season, write_sessions
 from headless_browser import needs_browser, quiet_page
 from PIL import Image
 
+from hsi_sc_nerf.batch.columns import calibration_columns
 from hsi_sc_nerf.batch.page import thumbnail, write_overview
 from hsi_sc_nerf.batch.tables import read_table
 from hsi_sc_nerf.cli.batch import CollectCommand
@@ -70,6 +72,17 @@ def test_the_page_needs_nothing_else_and_texts_from_outside_stay_texts(tmp_path)
     payload = json.loads(re.search(r'id="objects">(.*?)</script>', text, re.DOTALL)[1])
     assert payload["reports"] == [None, "objects/%C3%A4/report.html"]
     assert payload["columns"][2]["label"] == HOSTILE
+
+
+@pytest.mark.parametrize("unit", ["", "mL", "%", "mg/g", "g/100 g"])
+def test_a_label_leaves_out_the_whole_unit(tmp_path, unit):
+    write_sessions(tmp_path, [("a", "s")], ("object", "session"))
+    write_object(tmp_path / "objects" / "a")
+    table, found = read_table(tmp_path), calibration_columns("dry matter", unit)
+    table = replace(table, columns=(*table.columns, *found), rows=[[*row, 1.0, 0.1] for row in table.rows])
+    text = write_overview(table, tmp_path).read_text(encoding="utf-8")
+    payload = json.loads(re.search(r'id="objects">(.*?)</script>', text, re.DOTALL)[1])
+    assert [one["label"] for one in payload["columns"][-2:]] == ["dry matter", "dry matter sd"]
 
 
 def names(page):
@@ -148,6 +161,23 @@ def test_search_and_choices_leave_rows_and_points_out(browser, season):
         assert page.locator("#scatter .missing").is_visible()
         page.fill("input[name=words]", "no such words")
         assert names(page) == []
+
+
+@pytest.mark.slow
+@needs_browser
+def test_numbers_of_the_user_are_shown_as_they_are(browser, tmp_path):
+    """A date and the number of a tag are not rounded as a trait is."""
+    dates, tags = ["20261123", "20261125"], ["4.00123456", "123456.75"]
+    write_sessions(tmp_path, [*zip("ab", "ss", dates, tags, strict=True)], ("object", "session", "date", "tag"))
+    for name in "ab":
+        write_object(tmp_path / "objects" / name)
+    CollectCommand(tmp_path).main()
+    with quiet_page(browser, tmp_path / "index.html") as page:
+        assert (column(page, "date"), column(page, "tag")) == (dates, tags)
+        assert column(page, "volume, mL")[0].startswith("250.0 ±")
+        page.select_option("select[name=x]", label="date")
+        told = page.locator("#scatter .point").all_text_contents()
+        assert [one for date in dates for one in told if date in one] == told
 
 
 @pytest.mark.slow

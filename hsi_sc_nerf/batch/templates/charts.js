@@ -65,7 +65,7 @@ function drawDistribution(place, data, at, groups, sides) {
     rows.forEach((index, order) => {
       const value = data.rows[index][at], off = (((order * 0.618) % 1) - 0.5) * 20, odd = sides.get(index);
       const look = { class: odd ? "point odd" : "point", ...(odd ? {} : { fill: "var(--s0)" }) };
-      const told = `${shownNumber(value, column.spread === null ? null : data.rows[index][column.spread])} ${column.unit}`;
+      const told = `${shownValue(column, value, data.rows[index])} ${column.unit}`;
       svg.append(mark(data, index, odd ? DIAMOND : SHAPES[0], look, across.at(value), middle + off, told));
     });
     svg.append(drawn("line", { class: "median", x1: half, x2: half, y1: middle - 14, y2: middle + 14 }));
@@ -109,7 +109,7 @@ function drawScatter(place, legend, data, [x, y], groups, sidesOfBoth) {
       const [sx, sy] = [spreadOf(columnX, row), spreadOf(columnY, row)];
       if (all.length <= MOST_BARS) svg.append(...bars(columnX, sx, (d) => [inside(across.at(row[x] + d), left, width - 8), py], colour),
         ...bars(columnY, sy, (d) => [px, inside(up.at(row[y] + d), 14, height - 40)], colour));
-      const told = `${shownNumber(row[x], sx)} ${columnX.unit}, ${shownNumber(row[y], sy)} ${columnY.unit}`;
+      const told = `${shownValue(columnX, row[x], row)} ${columnX.unit}, ${shownValue(columnY, row[y], row)} ${columnY.unit}`;
       svg.append(mark(data, index, path, { class: "point", fill: colour }, px, py, told));
       if (sidesOfBoth.some((sides) => sides.has(index))) svg.append(drawn("circle", { class: "ring", cx: px, cy: py, r: 8 }));
     }

@@ -15,6 +15,11 @@ function shownNumber(value, spread) {
   return `${value.toFixed(decimals)} ± ${spread.toFixed(decimals)}`;
 }
 
+/** A row's number in a column; the user's own, such as a date or a label, as it is. */
+function shownValue(column, value, row) {
+  return column.group === "list" ? String(value) : shownNumber(value, column.spread === null ? null : row[column.spread]);
+}
+
 const headed = (column) => column.label + (column.unit ? `, ${column.unit}` : "");
 
 /** The object's name, and which of several on the table it is. */
@@ -55,8 +60,7 @@ function valueCell(column, row, at, side) {
   const value = row[at];
   if (value === null) return element("td");
   if (column.kind !== "number") return element("td", {}, column.kind === "truth" ? (value ? "yes" : "no") : value);
-  const spread = column.spread === null ? null : row[column.spread];
-  const [shown, uncertain] = shownNumber(value, spread).split(" ± ");
+  const [shown, uncertain] = shownValue(column, value, row).split(" ± ");
   const cell = element("td", { className: "number" });
   if (side) {
     const word = `outlier, ${side > 0 ? "above" : "below"} its group`;
