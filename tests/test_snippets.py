@@ -16,6 +16,9 @@ import torch
 import tyro
 from random_cloud import random_cloud
 
+import hsi_sc_nerf as hsn
+from hsi_sc_nerf.analysis.drawn_regions import DrawnRegion
+from hsi_sc_nerf.analysis.library import SpectralLibrary
 from hsi_sc_nerf.cli.main import command_line
 from hsi_sc_nerf.export.cloud import read_spectral_ply, stream
 from hsi_sc_nerf.export.formats import write_cloud
@@ -104,6 +107,35 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize(("page", "text"), blocks("python"), ids=lambda value: value.splitlines()[0])
 def test_python_blocks_run(page: str, text: str, folder: Path) -> None:
     exec(compile(text, page, "exec"), {})
+
+
+# Calls of the page's table that need a trained run, or take long.
+NOT_CALLED = re.compile(
+    r"\.\.\.|simulate_session|process_session|open_run|^run\.|view\.|traits\(|propose|light=|calibration"
+)
+
+
+@pytest.mark.slow
+def test_calls_in_the_table_of_the_python_page_run(folder: Path, tiny_dataset: tuple[Path, Path]) -> None:
+    pytest.importorskip("laspy")
+    data, session = tiny_dataset
+    (folder / "DATA").symlink_to(data)
+    (folder / "SESSION").symlink_to(session)
+    cloud, regions = (
+        hsn.read_cloud("point_cloud.ply"),
+        [DrawnRegion("top", np.zeros((2, 3)), np.array([True, False]))],
+    )
+    library = SpectralLibrary(("ripe",), cloud.wavelengths_nm, cloud.spectra[:1])
+    known = {"np": np, "hsn": hsn, "Path": Path, "cloud": cloud, "table": cloud.to_xarray()}
+    known |= {"library": library, "regions": regions}
+    hsn.write_library("skin.sli", library)
+    hsn.write_drawn_regions("regions.json", regions)
+    rows = [line.split("|") for line in PAGES["docs/how-to/python.md"].read_text("utf-8").splitlines()]
+    calls = [call for row in rows if len(row) == 5 for call in re.findall(r"`([\w.]+\(.*?\))`", row[1])]
+    called = [call for call in calls if not NOT_CALLED.search(call)]
+    assert len(called) > 10
+    for call in called:
+        assert eval(call, dict(known)) is not None or ".write_" in call, call
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from matplotlib import rc_context
 from hsi_sc_nerf.calibration.calibration_checks import check_white
 from hsi_sc_nerf.calibration.reference_checks import check_dark, check_lines
 from hsi_sc_nerf.calibration.white_source import WhiteSource
-from hsi_sc_nerf.capture.session import Session
+from hsi_sc_nerf.capture.session import Session, open_session
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.findings import Finding
@@ -62,7 +62,7 @@ class Inspection:
 
 
 def inspect_session(
-    session: Session,
+    session: Session | Path | str,
     poses: PoseMethod = "auto",
     scale_known: bool = False,
     white_source: Literal["auto"] | WhiteSource = "auto",
@@ -71,19 +71,21 @@ def inspect_session(
     """Check a session before anything is computed from it; a few lines and bands of each cube are read.
 
     Args:
-        session: the session, opened with ``skip_damaged``.
+        session: the session, opened with ``skip_damaged``, or its folder.
         poses: how poses will be found; without a scale, "auto" and "markers" are red.
         scale_known: whether something beside ``session.json`` gives the scale.
         white_source: where the white is.
         skip_damaged: whether the user leaves damaged captures out.
 
     Raises:
-        InputError: the session does not have that source of white, or a cube cannot be read.
+        InputError: the session cannot be opened or does not have that source of white, or a cube cannot be read.
 
     Example:
-        >>> inspection = inspect_session(open_session(Path("captures"), skip_damaged=True))
+        >>> inspection = inspect_session("captures")
         >>> refuse_red(inspection.findings)
     """
+    if not isinstance(session, Session):
+        session = open_session(Path(session), skip_damaged=True)
     of_white = check_white(session, white_source)  # first: it refuses a session without a white
     quicklooks = quicklooks_of(session)
     markers = find_markers(session, quicklooks)
