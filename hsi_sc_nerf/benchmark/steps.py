@@ -53,8 +53,9 @@ def run_step(
         folder: to run it in; by default the working folder.
 
     Raises:
-        InputError: the command failed; the message names its log.
+        InputError: the command failed; the message names its log. Or the system measures no processes.
     """
+    require_posix()
     started = time.perf_counter()
     # Warnings of libraries would hide the progress bars. Nothing here is compiled by PyTorch, but nerfstudio's import
     # compiles two functions of a method that is not used, for which PyTorch loads its compiler for seconds.
@@ -77,8 +78,25 @@ def run_step(
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode != 0:
         where = "above and in" if errors is None else "in"
-        raise InputError(f"the step '{name}' failed with status {process.returncode}; its output is {where} {log}.")
+        ended = f"failed with status {process.returncode}"
+        if process.returncode < 0:
+            ended = f"was ended by the system (signal {-process.returncode})"
+        if process.returncode == -signal.SIGKILL:
+            ended += ", most often because memory ran out: close other programs, or give it more memory"
+        raise InputError(f"the step '{name}' {ended}; its output is {where} {log}.")
     return StepCost(name, time.perf_counter() - started, peak_memory_mib(usage))
+
+
+def require_posix() -> None:
+    """Refuse systems that do not tell what another process cost.
+
+    Raises:
+        InputError: this is one of them, such as Windows.
+    """
+    if not hasattr(os, "wait4"):
+        raise InputError(
+            "this command works on Linux and macOS only; on Windows, call it in WSL (a Linux in Windows)."
+        )
 
 
 def own_cost(name: str, started: float) -> StepCost:

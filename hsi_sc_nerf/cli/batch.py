@@ -21,6 +21,7 @@ from hsi_sc_nerf import batch
 from hsi_sc_nerf.batch.plan import STEPS, outdated, read_plan, unlisted, write_plan
 from hsi_sc_nerf.batch.session_list import OBJECT, Row, read_sessions
 from hsi_sc_nerf.batch.session_steps import SessionSettings
+from hsi_sc_nerf.benchmark.steps import require_posix
 from hsi_sc_nerf.cli.step_words import check_words
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import make_folder, read_json, require_writable
@@ -71,6 +72,7 @@ class BatchCommand(SessionSettings):
             raise InputError(
                 "sessions or --output-dir are missing; write hsi-sc-nerf batch SESSIONS --output-dir OUT."
             )
+        require_posix()
         if find_spec("snakemake") is None:
             raise InputError("Snakemake is not installed; pip install 'hsi-sc-nerf[batch]' (Python 3.11 or newer).")
         out, rows = self.output_dir, read_sessions(self.sessions)
@@ -118,13 +120,26 @@ class BatchCommand(SessionSettings):
         words = ["--config", f"gpu={self.gpu}", *([f"plan={kept.resolve()}", "--dry-run"] if self.dry_run else [])]
         words += ["--keep-going", "--rerun-incomplete", "--rerun-triggers", "mtime", "input"]
         words += ["--forcerun", *again] if again else []
-        if not any(word.split("=")[0] in _ELSEWHERE for word in self.other_words):
+        others = [*self.other_words]
+        if not any(word.split("=")[0] in _ELSEWHERE for word in others):
             memory_mb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 10**6
-            words += ["--resources", "gpu=1", f"mem_mb={memory_mb}", "--cores", "all"]
+            resources = ["gpu=1", f"mem_mb={memory_mb}"]
+            words += ["--resources", *resources, "--cores", "all"]
+            others = _before_own_resources(resources, others)
         # Last a word that takes one value: the user's may begin with the name of a rule.
         words += ["--snakefile", str(SNAKEFILE.resolve()), "--directory", str(directory)]
-        if _snakemake([*words, *self.other_words]) != 0:
+        if _snakemake([*words, *others]) != 0:
             raise InputError(f"{out}: Snakemake ended early, see above; the same command goes on where it stopped.")
+
+
+def _before_own_resources(resources: Sequence[str], words: Sequence[str]) -> list[str]:
+    """The user's words for Snakemake, which takes the last --resources whole, with ours before each of theirs."""
+    found = []
+    for word in words:
+        option, _, value = word.partition("=")
+        own = option in ("--resources", "--res")
+        found += [option, *resources, *([value] if value else [])] if own else [word]
+    return found
 
 
 @contextmanager

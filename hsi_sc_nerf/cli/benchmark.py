@@ -96,7 +96,7 @@ def train_all(configurations: Sequence[Configuration], command: BenchmarkCommand
     console = Console(stderr=True)
     data = _packed(command.data)
     machine = describe_machine()
-    identity = {"machine": machine, "data_sha256": hashlib.sha256((data / TRANSFORMS_NAME).read_bytes()).hexdigest()}
+    identity = {"machine": machine, "data_sha256": _data_sha256(data)}
     jobs = {configuration.name: _job(configuration, command, data) for configuration in configurations}
     contents = {
         name: _finished(command.output_dir / name / "result.json", job, identity) for name, job in jobs.items()
@@ -159,6 +159,14 @@ def _packed(data: Path) -> Path:
     if is_unprocessed(data):
         data = process_session(data, processed_dir(data.resolve()))
     return open_packed(data).root.resolve()
+
+
+def _data_sha256(data: Path) -> str:
+    """Hash of frames and poses, and of the masks, which the user can mend; cubes follow from the first."""
+    digest = hashlib.sha256((data / TRANSFORMS_NAME).read_bytes())
+    for path in sorted((data / "masks").glob("*.png")):
+        digest.update(path.name.encode() + path.read_bytes())
+    return digest.hexdigest()
 
 
 def _job(configuration: Configuration, command: BenchmarkCommand, data: Path) -> Job:

@@ -3,7 +3,9 @@
 import csv
 import json
 import math
+import os
 import shutil
+import sys
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -26,9 +28,11 @@ from hsi_sc_nerf.benchmark.run import (
     Checkpoint,
     HeldOutViews,
 )
+from hsi_sc_nerf.benchmark.steps import run_step
 from hsi_sc_nerf.cli import benchmark
 from hsi_sc_nerf.cli.benchmark import BenchmarkCommand
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.files import write_png
 
 TINY = " ".join(
     (
@@ -233,6 +237,39 @@ def test_a_run_on_another_dataset_is_another_run(tiny_dataset, tmp_path, made_up
     (data / "transforms.json").write_text((data / "transforms.json").read_text() + "\n")
     asked.main()
     assert made_up.names == ["training of ours"] * 2
+
+
+def test_after_masks_were_mended_a_run_is_another_run(tiny_dataset, tmp_path, made_up):
+    data = shutil.copytree(tiny_dataset[0], tmp_path / "data")
+    asked = command((data,), tmp_path / "out", sets=())
+    asked.main()
+    mask = sorted((data / "masks").glob("*.png"))[0]
+    write_png(mask, 255 - cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE))
+    asked.main()
+    os.utime(mask)  # copied or touched, it is the same
+    asked.main()
+    assert made_up.names == ["training of ours"] * 2
+
+
+@pytest.mark.parametrize(
+    ("code", "told", "cause"),
+    [
+        ("raise SystemExit(3)", "status 3", False),
+        ("import os; os.kill(os.getpid(), 9)", "signal 9", True),
+        ("import os; os.kill(os.getpid(), 15)", "signal 15", False),
+    ],
+)
+def test_a_step_that_the_system_ended_says_so(tmp_path, code, told, cause):
+    with pytest.raises(InputError, match=told) as error:
+        run_step("train", [sys.executable, "-S", "-c", code], tmp_path / "train.log")
+    assert str(tmp_path / "train.log") in str(error.value)
+    assert ("memory" in str(error.value)) == cause
+
+
+def test_where_processes_are_not_measured_the_system_is_named(tmp_path, monkeypatch):
+    monkeypatch.delattr(os, "wait4")
+    with pytest.raises(InputError, match="Linux and macOS"):
+        run_step("train", [sys.executable], tmp_path / "train.log")
 
 
 def test_a_failed_run_loses_only_itself(tiny_dataset, tmp_path, made_up):

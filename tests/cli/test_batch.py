@@ -110,6 +110,28 @@ def test_words_of_snakemake_reach_it_unchanged_after_ours(tmp_path, monkeypatch,
     assert ["all" in one for one in found] == [True, False, False]
 
 
+@pytest.mark.parametrize(
+    ("own", "kept"),
+    [([], {"gpu": 1}), (["--resources", "mem_mb=5", "x=2"], {"mem_mb": 5}), (["--res=gpu=3"], {"gpu": 3})],
+)
+def test_resources_of_the_user_leave_the_others_as_they_are(tmp_path, monkeypatch, command, own, kept):
+    """Else two steps would be on one GPU."""
+    parser = pytest.importorskip("snakemake.cli").get_argument_parser()
+    found = []
+    monkeypatch.setattr(batch, "_snakemake", lambda given: found.append(parser.parse_args(given).resources) or 0)
+    make_sessions(tmp_path / "sessions", ["a"])
+    assert command(*words(tmp_path, *own)) == 0
+    given = {name: getattr(one, "value", one) for name, one in found[0].items()}
+    assert given.keys() == {"gpu", "mem_mb", *(["x"] if "x=2" in own else [])}
+    assert given == given | {"gpu": 1} | kept
+
+
+def test_where_steps_cannot_be_measured_the_system_is_named(tmp_path, monkeypatch):
+    monkeypatch.delattr(os, "wait4")
+    with pytest.raises(InputError, match="Linux and macOS"):
+        BatchCommand(sessions=tmp_path, output_dir=tmp_path / "out").main()
+
+
 def test_two_started_at_once_do_not_harm_each_other(tmp_path, monkeypatch, command):
     """The second comes before Snakemake of the first has its lock: it is refused, and the list stays the first's."""
     out = tmp_path / "out"
