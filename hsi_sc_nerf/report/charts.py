@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -66,6 +66,12 @@ class Curve:
     dashed: bool = False
 
 
+def _from_left_to_right(curve: Curve) -> Curve:
+    order = np.argsort(curve.x, kind="stable")
+    spread = None if curve.spread is None else curve.spread[order]
+    return replace(curve, x=curve.x[order], y=curve.y[order], spread=spread)
+
+
 def line_chart(
     curves: Sequence[Curve],
     *,
@@ -79,7 +85,7 @@ def line_chart(
     """Curves over a common axis, as an ``svg`` element.
 
     Args:
-        curves: at least one; NaN is a gap.
+        curves: at least one, drawn in the order of ``x``, as bands need not be in a file; NaN is a gap.
         x_label: with its unit.
         y_label: with its unit.
         alt: description for readers who do not see the chart.
@@ -92,6 +98,7 @@ def line_chart(
         >>> curve = Curve("measured", wavelengths_nm, np.sin(wavelengths_nm / 100.0))
         >>> svg = line_chart([curve], x_label="wavelength (nm)", y_label="reflectance", alt="A spectrum")
     """
+    curves = [_from_left_to_right(curve) for curve in curves]
     named = [curve.name for curve in curves if curve.name]
     columns = max(1, _LEGEND_CHARACTERS // (8 + max(map(len, named), default=0)))
     rows = -(-len(named) // columns)

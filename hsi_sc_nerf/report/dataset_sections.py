@@ -13,6 +13,7 @@ from markupsafe import Markup
 from hsi_sc_nerf.files import content_of
 from hsi_sc_nerf.findings import EFFECT_COLUMNS, Finding, effect_rows, judged
 from hsi_sc_nerf.packed.dataset import PackedDataset
+from hsi_sc_nerf.poses.result import is_full_turn
 from hsi_sc_nerf.report.charts import Curve, line_chart
 from hsi_sc_nerf.report.page import (
     Block,
@@ -192,12 +193,22 @@ def masks_section(dataset: PackedDataset) -> Section:
         Figure([chart], "Pixels of the object in each frame. Check the masks of frames that stand out below."),
         *_folded_picture(dataset, "masks.png", "All frames in pseudo-RGB with the outline of the mask in magenta"),
     ]
-    return Section("masks", "Masks", blocks, judge_masks(areas_px, [frame.capture for frame in dataset.frames]))
+    closed = is_full_turn(np.array([frame.angle_deg for frame in dataset.frames]))
+    findings = judge_masks(areas_px, [frame.capture for frame in dataset.frames], closed)
+    return Section("masks", "Masks", blocks, findings)
 
 
-def judge_masks(areas_px: Int[np.ndarray, "frames"], captures: Sequence[str]) -> list[Finding]:
-    """Frames whose mask is much larger or smaller than those of the frames before and after."""
-    neighbours = np.median([np.roll(areas_px, shift) for shift in (-2, -1, 1, 2)], axis=0)
+def judge_masks(areas_px: Int[np.ndarray, "frames"], captures: Sequence[str], closed: bool) -> list[Finding]:
+    """Frames whose mask is much larger or smaller than those of the frames before and after.
+
+    Args:
+        areas_px: size of each frame's mask.
+        captures: names of the frames.
+        closed: whether the first frame comes after the last one; if not, frames at the ends have neighbours on one
+            side only.
+    """
+    count, padded = len(areas_px), np.pad(areas_px, 2, mode="wrap" if closed else "reflect")
+    neighbours = np.median([padded[first : first + count] for first in (0, 1, 3, 4)], axis=0)
     jumps = np.abs(areas_px / np.maximum(neighbours, 1.0) - 1.0)
     sentence = (
         f"Masks differ from those of the frames beside them by up to {100.0 * jumps.max():.1f} % of their size (good "

@@ -247,10 +247,14 @@ def spectra_section(view: HeldOutView, wavelengths_nm: Float[np.ndarray, "bands"
 
 
 def judge_spectra(points: Mapping[str, PixelSpectra]) -> list[Finding]:
-    """How far rendered mean spectra are from the measured ones, by the points' letters."""
+    """How far rendered mean spectra are from the measured ones, by the points' letters.
+
+    A point around which no band was measured does not count.
+    """
     errors = {
-        letter: float(np.nanmean(np.abs(one.rendered - one.measured)) / np.nanmean(one.measured))
+        letter: float(np.nansum(np.abs(one.rendered - one.measured)) / np.nansum(one.measured))
         for letter, one in points.items()
+        if np.nansum(one.measured) > 0.0
     }
     if not errors:
         return []

@@ -32,6 +32,15 @@ def test_a_straight_line_is_straight_and_rises():
     np.testing.assert_allclose(slopes[:, 1] / slopes[:, 0], slopes[0, 1] / slopes[0, 0], rtol=1e-3)
 
 
+def test_bands_in_any_order_are_one_line_and_one_band():
+    x, y, spread = np.array([400.0, 500.0, 600.0, 700.0]), np.array([0.1, 0.4, 0.2, 0.3]), np.full(4, 0.05)
+    charts = [
+        line_chart([Curve("", x[order], y[order], spread[order])], **LABELS) for order in ([0, 1, 2, 3], [2, 0, 3, 1])
+    ]
+    for css_class in ("line", "band"):
+        assert paths(charts[0], css_class) == paths(charts[1], css_class)
+
+
 def test_decades_are_equally_far_apart():
     y = 10.0 ** -np.array([0.0, 2.0, 1.0, 3.0])
     (path,) = paths(line_chart([Curve("", np.arange(4.0), y)], logarithmic=True, **LABELS), "line")

@@ -12,14 +12,18 @@ from hsi_sc_nerf.report.view_sections import judge_bands, judge_spectra, judge_v
 
 NM = np.linspace(400.0, 1000.0, 7)
 EVEN = np.full(8, 1000)
+GROWING = 1000 + 30 * np.arange(8)
+"""A part of a turn, from the narrow side of an object to the broad one."""
 
 
 def views(*angles_rad):
     return [SimpleNamespace(name=f"pear_{i}", metrics={"sam": angle}) for i, angle in enumerate(angles_rad)]
 
 
-def point(factor):
-    return SimpleNamespace(measured=NM / 1000.0, rendered=factor * NM / 1000.0)
+def point(factor, measured=True):
+    """Spectra of a point; bands that are not ``measured`` are NaN in both."""
+    spectrum = np.where(measured, NM / 1000.0, np.nan)
+    return SimpleNamespace(measured=spectrum, rendered=factor * spectrum)
 
 
 def cloud(*incidences_deg):
@@ -60,6 +64,9 @@ def poses(px, used, *warnings):
         (judge_bands(np.array([0.08, 0.04]), NM[:2], np.array([0.08, 0.0])), ["green"], "0.040 beyond the noise"),
         (judge_spectra({"A": point(1.02), "B": point(0.97)}), ["green"], "at B, 3.0 %"),
         (judge_spectra({"A": point(1.1), "B": point(1.0)}), ["amber"], "at A, 10.0 %"),
+        (judge_spectra({"A": point(1.1, False), "B": point(1.0)}), ["green"], "at B, 0.0 %"),
+        (judge_spectra({"A": point(1.02, NM > 500), "B": point(1.0)}), ["green"], "at A, 2.0 %"),
+        (judge_spectra({"A": point(1.1, False)}), [], ""),
         (judge_spectra({}), [], ""),
         (judge_comparison(compared(95.0)), ["green"], "95.0 %"),
         (judge_comparison(compared(80.0)), ["amber"], "recall"),
@@ -73,8 +80,12 @@ def poses(px, used, *warnings):
         (judge_calibration(0.001, {"measured": True}), ["green"], "0.10 %"),
         (judge_calibration(0.03, {"measured": False, "reason": "no wall"}), ["amber", "amber"], "no wall"),
         (judge_calibration(0.2, {}), ["red"], "20.00 %"),
-        (judge_masks(EVEN + 20 * (np.arange(8) % 2), list("abcdefgh")), ["green"], "1.0 %"),
-        (judge_masks(np.where(np.arange(8) == 3, 500, EVEN), list("abcdefgh")), ["amber"], "look at d,"),
+        (judge_masks(EVEN + 20 * (np.arange(8) % 2), list("abcdefgh"), True), ["green"], "1.0 %"),
+        (judge_masks(np.where(np.arange(8) == 3, 500, EVEN), list("abcdefgh"), True), ["amber"], "look at d,"),
+        (judge_masks(np.where(np.arange(8) == 7, 500, EVEN), list("abcdefgh"), False), ["amber"], "look at h,"),
+        (judge_masks(GROWING, list("abcdefgh"), False), ["green"], "4.3 %"),
+        (judge_masks(GROWING, list("abcdefgh"), True), ["amber"], "look at h, "),
+        (judge_masks(EVEN[:1], ["a"], False), ["green"], "0.0 %"),
         (judge_poses(poses(0.3, 9)), ["green"], "0.30 px"),
         (judge_poses(poses(2.0, 7, "It wobbles.")), ["amber", "amber", "amber"], "2 of 9 frames"),
         (judge_poses({}), [], ""),
