@@ -55,8 +55,8 @@ class MaterialCommand:
     matte body without gloss, captured once for each chamber. An object with upright sides alone, such as an ear of
     maize, does not show how high a lamp stands."""
     white_azimuth_deg: float = between(-90.0, 90.0, default=0.0)
-    """Direction that the white reference faced, degrees: 0 is to the camera, positive is to the right of it. Not used
-    with --light, whose session had its own."""
+    """Direction that the white reference faced, degrees: 0 faces the camera; positive turns towards the right edge of
+    the camera's picture, negative towards the left. Not used with --light, whose session had its own."""
     white_elevation_deg: float = between(-90.0, 90.0, default=0.0)
     """The same above the optical axis of the camera."""
 

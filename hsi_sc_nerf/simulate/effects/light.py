@@ -81,7 +81,8 @@ class Lamp(ViewLightEffect):
     fraction: float = between(0.0, 1.0, default=0.4)
     """Fraction of the lamp in the light on a white tarp that faces it."""
     azimuth_deg: float = between(-180.0, 180.0, default=-35.0)
-    """Azimuth of the lamp, degrees: 0 is behind the camera, positive is to the right of it."""
+    """Azimuth of the lamp, degrees: 0 is behind the camera; positive turns towards the right edge of the camera's
+    picture, negative towards the left."""
     elevation_deg: float = between(-90.0, 90.0, default=30.0)
     """Elevation of the lamp above the optical axis of the camera, degrees."""
 
