@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from hsi_sc_nerf.benchmark.configurations import training_config
 from hsi_sc_nerf.benchmark.steps import peak_memory_mib
+from hsi_sc_nerf.evaluation.chosen_views import spread_of_views
 from hsi_sc_nerf.files import write_json
 
 if TYPE_CHECKING:
@@ -140,9 +141,7 @@ class HeldOutViews:
     """
 
     def __init__(self, loader: EvalDataloader, count: int | None) -> None:
-        total = len(loader)
-        count = min(count or total, total)
-        self.loader, self.indices = loader, [i * total // count for i in range(count)]
+        self.loader, self.indices = loader, spread_of_views(len(loader), count or len(loader))
 
     def __len__(self) -> int:
         return len(self.indices)

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from hsi_sc_nerf.evaluation.chosen_views import spread_of_views
 from hsi_sc_nerf.evaluation.spectral_metrics import (
     decibel,
     metrics_of_regions,
@@ -142,12 +143,6 @@ def object_angles(views: Sequence[ViewScores]) -> Float[np.ndarray, "n"]:
     """Spectral angles (radians) of all the object's pixels of all views that have one."""
     angles = np.concatenate([view.angle_rad[view.mask] for view in views])
     return angles[np.isfinite(angles)]
-
-
-def spread_of_views(count: int, number: int) -> list[int]:
-    """Indices of ``number`` of ``count`` views, evenly spread; at most all."""
-    number = min(count, number)
-    return [(2 * i + 1) * count // (2 * number) for i in range(number)]
 
 
 @dataclass(frozen=True, eq=False)

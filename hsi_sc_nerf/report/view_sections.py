@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 
 from hsi_sc_nerf import paper
+from hsi_sc_nerf.evaluation.chosen_views import spread_of_views
 from hsi_sc_nerf.findings import Finding, judged
 from hsi_sc_nerf.plotting import ANGLE_COLOURS, ANGLE_DRAWN_RAD, ERROR_DRAWN, coloured
 from hsi_sc_nerf.report.charts import Curve, line_chart
@@ -20,7 +21,6 @@ from hsi_sc_nerf.report.held_out_views import (
     ViewScores,
     object_angles,
     sample_mean_and_sd,
-    spread_of_views,
 )
 from hsi_sc_nerf.report.page import Block, Figure, Section, Table, embedded_array
 from hsi_sc_nerf.spectra import to_8_bit

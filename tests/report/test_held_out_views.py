@@ -20,7 +20,6 @@ from hsi_sc_nerf.report.held_out_views import (
     render_held_out,
     sample_mean_and_sd,
     score_view,
-    spread_of_views,
 )
 from hsi_sc_nerf.report.run_sections import flat_settings, read_scalars, settings_section, shortened, stage_ends
 
@@ -48,11 +47,6 @@ def test_mean_and_deviation_over_the_views_that_have_a_band():
     mean, sd = sample_mean_and_sd(np.array([[1.0, np.nan, 5.0], [3.0, np.nan, np.nan]]))
     np.testing.assert_allclose(mean, [2.0, np.nan, 5.0])
     np.testing.assert_allclose(sd, [np.sqrt(2.0), np.nan, 0.0])
-
-
-@pytest.mark.parametrize(("count", "wanted", "expected"), [(6, 2, [1, 4]), (3, 9, [0, 1, 2]), (5, 1, [2])])
-def test_views_are_spread_evenly(count, wanted, expected):
-    assert spread_of_views(count, wanted) == expected
 
 
 def test_spectra_around_a_point_are_those_of_its_valid_pixels():
