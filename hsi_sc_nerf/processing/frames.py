@@ -36,6 +36,8 @@ from hsi_sc_nerf.spectra import bands_within, nearest_bands, to_8_bit
 from hsi_sc_nerf.terminal import progress_bar
 
 _DIGEST_BYTES = hashlib.sha256().digest_size
+# Settings that change how fast a dataset is made, not what is in it.
+_NOT_IN_RESULT = ("workers",)
 
 
 @dataclass(frozen=True)
@@ -132,9 +134,12 @@ def pack_frames(
             own.buffer = np.empty(num_values, np.uint16)
         capture, frame_calibration = session.frames[index], calibration.frames[index]
         paths = FramePaths.of(output_dir, capture.name)
-        key = fingerprint([pseudo_rgb_nm, capture_files(session, capture), _digest(frame_calibration)])
+        cube = calibration.cubes[index]
+        # Wavelengths may come from another file than the capture's.
+        settings = [pseudo_rgb_nm, cube.wavelengths_nm.tolist(), _digest(frame_calibration)]
+        key = fingerprint([capture_files(session, capture), settings])
         return read_cache(paths, key) or process_frame(
-            calibration.cubes[index],
+            cube,
             frame_calibration,
             paths,
             key,
@@ -239,11 +244,12 @@ def session_fingerprint(session: Session, config: Any, files: Iterable[Path] = (
 
     Args:
         session: its files count by name, size and time of last change.
-        config: settings, a dataclass.
+        config: settings, a dataclass; the number of workers does not count.
         files: further files that the settings name; those that do not exist are left out.
     """
     named = _stamps(session.path, [path for path in files if path.is_file()])
-    return fingerprint([session_files(session), asdict(config), named])
+    settings = {name: value for name, value in asdict(config).items() if name not in _NOT_IN_RESULT}
+    return fingerprint([session_files(session), settings, named])
 
 
 def fingerprint(content: Any) -> str:

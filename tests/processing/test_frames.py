@@ -1,6 +1,7 @@
 """The files of one frame in a packed dataset, and when it counts as finished."""
 
 import hashlib
+import json
 from dataclasses import fields, replace
 
 import cv2
@@ -8,11 +9,13 @@ import numpy as np
 import pytest
 
 from hsi_sc_nerf.calibration.reflectance import FrameCalibration, PixelCounts
+from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, calibrate_session
 from hsi_sc_nerf.capture.envi import open_cube, write_cube
+from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, PixelFlag, unpack
 from hsi_sc_nerf.processing.foreground_score import smoothed_bins
-from hsi_sc_nerf.processing.frames import FramePaths, process_frame, read_cache
+from hsi_sc_nerf.processing.frames import FramePaths, pack_frames, process_frame, read_cache
 
 WAVELENGTHS_NM = np.array([440.0, 500.0, 550.0, 600.0, 650.0, 900.0])
 BANDS = len(WAVELENGTHS_NM)
@@ -147,3 +150,22 @@ def test_a_cache_does_not_vouch_for_a_cube_of_other_settings(cube, tmp_path):
     with pytest.raises(InputError, match="cannot be written"):
         process(cube, tmp_path / "data", replace(CALIBRATION, gain=CALIBRATION.gain / 2.0), stamp="other settings")
     assert not paths.cache.exists()
+
+
+def test_corrected_band_centres_reach_the_packed_cubes(tmp_path):
+    session, output = tmp_path / "session", tmp_path / "data"
+    rng = np.random.default_rng(0)
+    for name in ("ball_1", "ball_2", "white_reference"):
+        counts = rng.uniform(1000.0, 3000.0, (20, 16, BANDS)).astype(np.uint16)
+        write_cube(session / f"{name}.hdr", counts, wavelengths_nm=None)
+    (session / "session.json").write_text(json.dumps({"band_centres": "bands.csv"}))
+
+    def packed_nm(first_nm: float) -> np.ndarray:
+        centres_nm = first_nm + 50.0 * np.arange(BANDS)
+        (session / "bands.csv").write_text("nm\n" + "\n".join(map(str, centres_nm)) + "\n")
+        opened = open_session(session)
+        pack_frames(opened, calibrate_session(opened, CalibrationConfig(lamp_drift="never")), output)
+        return open_cube(FramePaths.of(output, "ball_2").cube).wavelengths_nm
+
+    assert packed_nm(450.0)[0] == 450.0
+    assert packed_nm(500.0)[0] == 500.0

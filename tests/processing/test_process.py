@@ -188,6 +188,7 @@ def test_the_same_input_is_processed_once_and_other_settings_redo_what_depends_o
     output = run(session, tmp_path / "data")
     before, stamp = written(output), (output / "transforms.json").stat().st_mtime_ns
     assert run(session, output, poses=no_markers) == output
+    assert run(session, output, ProcessConfig(workers=1), poses=no_markers) == output
     assert rewritten(output, before) == []
     assert (output / "transforms.json").stat().st_mtime_ns == stamp
     run(session, output, ProcessConfig(masks=MaskConfig(threshold=0.1)))
