@@ -10,12 +10,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from hsi_sc_nerf.calibration.white_source import WhiteSource, exposure_ratio, panel_reflectance, white_source
+from hsi_sc_nerf.calibration.white_source import WhiteSource, white_source
 from hsi_sc_nerf.capture.session import Session
 from hsi_sc_nerf.findings import Finding, Level, judged
-from hsi_sc_nerf.inspection.quicklook import PICTURE_NM, Quicklook
+from hsi_sc_nerf.inspection.quicklook import Quicklook
 from hsi_sc_nerf.poses.marker_detection import Detections
-from hsi_sc_nerf.spectra import nearest_bands
 
 PAPER_PERCENTILE = 85.0
 """About half of a marker is white, some of it blurred with black."""
@@ -45,11 +44,10 @@ def check_paper(
     if not session.has_counts:
         return []
     found = []
-    for frame, quicklook, seen in zip(session.frames, quicklooks, detections, strict=True):
-        scale = 1.0 if session.white is None else exposure_ratio(session.white, frame)
+    for quicklook, seen in zip(quicklooks, detections, strict=True):
         picture = quicklook.picture.mean(axis=-1)
         found += [
-            scale * ink_and_paper(picture, corners)
+            ink_and_paper(picture, corners)
             for corners in seen.values()
             if np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).min() >= LEAST_SIDE_PX
         ]
@@ -66,7 +64,6 @@ def check_paper(
 
 
 def _of_paper(session: Session, paper: float, markers: int) -> Finding:
-    paper *= float(panel_reflectance(session)[nearest_bands(session.wavelengths_nm, PICTURE_NM)].mean())
     values = {"reflectance": paper, "markers": markers}
     text = f"the markers' white paper has a reflectance of {paper:.2g}"
     if USUAL[0] <= paper <= USUAL[1]:

@@ -24,6 +24,7 @@ from hsi_sc_nerf.calibration.detector import (
     spread_rows,
 )
 from hsi_sc_nerf.calibration.reference_checks import bright_pixels
+from hsi_sc_nerf.calibration.white_source import exposure_ratio, panel_reflectance
 from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.poses.session_pictures import edge_slope
 from hsi_sc_nerf.spectra import nearest_bands, to_8_bit
@@ -34,6 +35,8 @@ NEIGHBOURS = 2
 """Number of neighbouring bands averaged into a channel of a picture; they lie side by side in the file."""
 DARK_SIGMAS = 3.0
 """A value is dark if it exceeds the dark cube by less than this many standard deviations."""
+BRIGHT_PERCENTILE = 95.0
+"""Percentile of a picture that counts as its brighter part."""
 WORKERS = 2
 
 
@@ -43,7 +46,7 @@ class Quicklook:
 
     Attributes:
         name: name of the capture.
-        picture: pseudo-RGB, about 1 on white.
+        picture: pseudo-RGB reflectance; without a white, relative to the brightest part.
         top_counts: the largest reading of the lines read.
         at_top_fraction: fraction of the readings with ``top_counts``, by band.
         dark_fraction: fraction of the readings without light, by band.
@@ -65,22 +68,25 @@ class Quicklook:
 
     @property
     def gray(self) -> UInt8[np.ndarray, "lines samples"]:
-        """Mean of the picture's channels, which is searched for markers."""
-        return to_8_bit(self.picture.mean(axis=-1))
+        """Mean of the picture's channels, which is searched for markers.
+
+        White is the picture's brighter part: markers are seen even if a header states a wrong integration time.
+        """
+        mean = self.picture.mean(axis=-1)
+        return to_8_bit(mean / max(float(np.percentile(mean, BRIGHT_PERCENTILE)), 1e-9))
 
 
 def quicklooks_of(session: Session) -> list[Quicklook]:
     """The quicklooks of a session's frames, in its order."""
-    white = white_level(session)
     with ThreadPoolExecutor(WORKERS) as pool:
-        return list(pool.map(lambda capture: quicklook_of(capture, white), session.frames))
+        return list(pool.map(quicklook_of, session.frames, white_levels(session)))
 
 
 def quicklook_of(capture: Capture, white: Float[np.ndarray, "bands"]) -> Quicklook:
     """The quicklook of one capture.
 
     Args:
-        white: counts of a white above dark, of the same integration time.
+        white: counts above dark that are a reflectance of 1 at this capture's integration time.
     """
     cube = capture.cube
     counts = cube.memmap()
@@ -115,14 +121,21 @@ def quicklook_of(capture: Capture, white: Float[np.ndarray, "bands"]) -> Quicklo
     )
 
 
-def white_level(session: Session) -> Float[np.ndarray, "bands"]:
-    """Counts above dark of the session's white by band; without a white, those of the brightest part of a frame."""
-    return white_counts(session.frames[0] if session.white is None else session.white)
+def white_levels(session: Session) -> list[Float[np.ndarray, "bands"]]:
+    """Counts above dark that are a reflectance of 1 in each frame, by band.
+
+    They are those of the tarp at the frame's integration time, over its own reflectance. Without a tarp, or without
+    raw counts, the brightest part of the first frame is taken for white.
+    """
+    if session.white is None or not session.has_counts:
+        return [white_counts(session.frames[0])] * len(session.frames)
+    level = white_counts(session.white) / panel_reflectance(session)
+    return [level / exposure_ratio(session.white, frame) for frame in session.frames]
 
 
 def white_counts(capture: Capture) -> Float[np.ndarray, "bands"]:
     """Counts above dark of the brightest part of a capture, by band."""
-    level = np.percentile(light_of_some_lines(capture.cube, capture.dark), 95.0, axis=(0, 1))
+    level = np.percentile(light_of_some_lines(capture.cube, capture.dark), BRIGHT_PERCENTILE, axis=(0, 1))
     return np.maximum(level, 1e-3 * max(float(level.max()), 1e-9))
 
 
@@ -132,8 +145,9 @@ def reflectance_noise(session: Session) -> float:
     It is measured between the first two frames. Changes of the lamps do not contribute. Moving parts do: the limit is
     1.3 times the noise if a third of the picture turns, and twice the noise if half does.
     """
-    first, second = (light_of_some_lines(frame.cube, frame.dark) for frame in session.frames[:2])
-    change = (second - first) / white_level(session)
+    pairs = zip(session.frames[:2], white_levels(session), strict=False)
+    first, second = (light_of_some_lines(frame.cube, frame.dark) / white for frame, white in pairs)
+    change = second - first
     deviation = median_abs_deviation(change.reshape(-1, change.shape[-1]), scale="normal")
     return float(np.median(deviation) / np.sqrt(2.0))
 

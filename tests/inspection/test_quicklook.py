@@ -1,0 +1,56 @@
+"""Pictures of frames are reflectance, whatever the white is and however long it was exposed."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from inspection_session import INFO, SIZE_PX, WAVELENGTHS_NM, rendered, write_one
+
+from hsi_sc_nerf.capture.envi import write_cube
+from hsi_sc_nerf.capture.session import open_session
+from hsi_sc_nerf.inspection.inspect import inspect_session
+from hsi_sc_nerf.inspection.quicklook import quicklooks_of, reflectance_noise
+
+WHITE = 0.98
+"""Of the scene; what is as bright counts as 1."""
+
+
+def write_white(folder, reflectance, **fields):
+    write_one(folder, "white_reference", np.full((SIZE_PX, SIZE_PX, len(WAVELENGTHS_NM)), reflectance), **fields)
+
+
+def brightness(folder):
+    return float(quicklooks_of(open_session(folder))[0].picture.mean())
+
+
+@pytest.mark.parametrize("times_as_long", [0.8, 5.0])
+def test_frames_that_were_exposed_longer_or_shorter_than_the_white(session, times_as_long):
+    expected, noise = brightness(session), reflectance_noise(open_session(session))
+    write_white(session, WHITE / times_as_long, tint=10 / times_as_long)
+    assert brightness(session) == pytest.approx(expected, rel=0.02)
+    assert reflectance_noise(open_session(session)) == pytest.approx(noise, rel=0.1)
+    levels = {finding.name: finding.level for finding in inspect_session(open_session(session)).findings}
+    assert (levels["markers"], levels["turn"], levels["paper"]) == ("green", "green", "green")
+
+
+def test_a_panel_whose_reflectance_is_known(session):
+    expected = brightness(session)
+    write_white(session, 0.4)
+    (session / "panel.csv").write_text(f"wavelength_nm,reflectance\n400,{0.4 / WHITE}\n1000,{0.4 / WHITE}\n")
+    (session / "session.json").write_text(json.dumps({**INFO, "panel_reflectance": "panel.csv"}))
+    assert brightness(session) == pytest.approx(expected, rel=0.02)
+
+
+def test_finished_reflectance_beside_a_raw_white(session):
+    expected = brightness(session)
+    for number, image in enumerate(rendered(12)):
+        name = f"fruit_{number:02d}"
+        shutil.rmtree(session / name)
+        product = session / name / "results" / f"REFLECTANCE_{name}.hdr"
+        write_cube(product, image.astype(np.float32), wavelengths_nm=WAVELENGTHS_NM)
+    inspection = inspect_session(open_session(session))
+    assert inspection.session.white is not None
+    # The brightest part of a frame is paper.
+    assert inspection.quicklooks[0].picture.mean() == pytest.approx(expected / 0.76, rel=0.2)
+    assert inspection.markers.usual_step_deg == pytest.approx(30.0, abs=0.5)
