@@ -76,12 +76,11 @@ class Markers:
 
     @property
     def usual_step_deg(self) -> float | None:
-        """Usual turn from frame to frame, positive counter-clockwise; None if it is not known."""
+        """Usual turn from frame to frame, positive counter-clockwise; None if it is not known, or none is usual."""
         steps = self.steps_deg[np.isfinite(self.steps_deg)]
-        if len(steps) < max(1, len(self.angles_deg) // 3):
-            return None
-        median = np.median(steps)
-        return float(steps[np.abs(steps - median) <= 0.5 * abs(median)].mean())
+        median = np.median(steps) if len(steps) else 0.0
+        near = steps[np.abs(steps - median) <= 0.5 * abs(median)]
+        return float(near.mean()) if len(near) >= max(1, len(self.angles_deg) // 3) else None
 
 
 def find_markers(session: Session, quicklooks: Sequence[Quicklook]) -> Markers:
@@ -175,6 +174,12 @@ def _turn(session: Session, markers: Markers) -> Finding:
     known = np.isfinite(markers.angles_deg)
     step = markers.usual_step_deg
     names = [frame.name for frame in session.frames]
+    if step is None and known.sum() > len(known) // 2:
+        sentence = (
+            "The table's steps from frame to frame are too different for one to be usual; check that the frames' "
+            "names are in the order of the turn."
+        )
+        return Finding("turn", "amber", sentence)
     if step is None or abs(step) < 0.1:
         return Finding(
             "turn", "amber", "The table's turn is not known before the poses: too few frames share markers."

@@ -8,7 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from inspection_session import INFO, LAMP, READ_NOISE_COUNTS, SIZE_PX, frame_picture, write_one, write_turntable
+from inspection_session import (
+    INFO,
+    LAMP,
+    READ_NOISE_COUNTS,
+    SIZE_PX,
+    frame_picture,
+    rendered,
+    write_one,
+    write_turntable,
+)
 
 from hsi_sc_nerf.capture.envi import open_cube, write_cube
 from hsi_sc_nerf.capture.session import open_session
@@ -223,3 +232,12 @@ def test_a_turn_with_a_gap_and_a_stop(session):
     assert findings["turn"].level == "amber"
     assert "fruit_09 to fruit_10" in findings["turn"].sentence
     assert findings["turn"].values["largest_gap_deg"] == pytest.approx(90.0, abs=6.0)
+
+
+def test_frames_of_a_table_that_turned_there_and_back(session):
+    for number, shown in enumerate([0, 2, 4, 6, 8, 10, 10, 8, 6, 4, 2, 0]):
+        write_one(session, f"fruit_{number:02d}", rendered(12)[shown])
+    inspection, findings = inspect(session)
+    assert findings["turn"].level == "amber"
+    assert "order" in findings["turn"].sentence
+    assert "direction" not in inspection.session_json

@@ -5,7 +5,7 @@ import pytest
 from exact_turntable import marker_observations, marker_turntable
 from turntable_scene import MarkerScene
 
-from hsi_sc_nerf.inspection.marker_checks import turn_and_rotation_deg
+from hsi_sc_nerf.inspection.marker_checks import Markers, turn_and_rotation_deg
 
 SIZE_PX = 256
 
@@ -58,3 +58,18 @@ def test_a_frame_that_shares_no_marker_has_no_angle():
     angles_deg, _ = turn_and_rotation_deg(found, (SIZE_PX, SIZE_PX))
     assert np.flatnonzero(np.isnan(angles_deg)).tolist() == [4, 5]
     assert np.isnan(turn_and_rotation_deg([{}, {}], (SIZE_PX, SIZE_PX))[0]).all()
+
+
+@pytest.mark.parametrize(
+    ("angles_deg", "usual_deg"),
+    [
+        ([0, 30, 60, 120, 120, 150, 180], 30.0),
+        ([0, 60, 120, 180, 120, 60, 0], None),
+        ([0, 100, 95, 300, 20, 210, 215], None),
+        ([0, np.nan, np.nan, np.nan, 120, 150, np.nan], None),
+        ([np.nan] * 7, None),
+    ],
+)
+def test_a_usual_step_is_one_that_many_frames_share(angles_deg, usual_deg):
+    found = Markers("DICT_5X5_50", [{}] * 7, np.array(angles_deg, float), 0, 20.0, 0.1)
+    assert found.usual_step_deg == usual_deg
