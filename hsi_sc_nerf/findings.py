@@ -6,6 +6,7 @@ by its evidence (docs/validation/effects.md).
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -66,8 +67,8 @@ def names_in_short(names: Sequence[str], most: int = 6) -> str:
 
 
 def leave_out(names: Sequence[str]) -> str:
-    """The options that leave captures out."""
-    return " ".join(f"--exclude {name}" for name in names)
+    """The options that leave captures out, ready for a shell."""
+    return " ".join(f"--exclude {shlex.quote(name)}" for name in names)
 
 
 def judged(name: str, value: float, limits: tuple[float, float], sentence: str, advice: str) -> Finding:

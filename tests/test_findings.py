@@ -1,13 +1,14 @@
 """What users are told: messages of errors, findings, tables, and none of the libraries' warnings."""
 
 import os
+import shlex
 import subprocess
 import sys
 
 import pytest
 
 from hsi_sc_nerf.errors import LONGEST_MESSAGE, InputError, shown
-from hsi_sc_nerf.findings import Finding, refuse_red
+from hsi_sc_nerf.findings import Finding, leave_out, refuse_red
 from hsi_sc_nerf.terminal import markdown_table
 
 
@@ -37,6 +38,12 @@ def test_accepted_findings_stop_nothing() -> None:
     refuse_red(FINDINGS, accepted=["white", "dates"])
     with pytest.raises(InputError, match=r"^No white"):
         refuse_red(FINDINGS, accepted=["dates"])
+
+
+def test_options_that_leave_captures_out_can_be_copied_to_a_shell() -> None:
+    assert leave_out(["apple_01", "apple_02"]) == "--exclude apple_01 --exclude apple_02"
+    names = ["apple 1", "o'clock", "a;b"]
+    assert shlex.split(leave_out(names))[1::2] == names
 
 
 DOCUMENTED = "ignore::FutureWarning:torch.jit._script"

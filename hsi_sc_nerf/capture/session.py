@@ -189,7 +189,7 @@ def open_session(path: Path, *, exclude: Collection[str] = (), skip_damaged: boo
     damaged = {name: reason for name, reason in found.damaged.items() if name not in exclude}
     kept = [files for files in found.captures if files.name not in exclude]
     captures = open_captures(kept, info, path, damaged)
-    info = replace(info, white_reference=_white_name(info, [*(files.name for files in kept), *damaged]))
+    info = replace(info, white_reference=name_of_white(info, [*(files.name for files in kept), *damaged]))
     white_name = info.white_reference.lower()
     broken_white = next((reason for name, reason in damaged.items() if name.lower() == white_name), None)
     if broken_white is None and damaged and not captures:  # all for the same reason, most likely
@@ -214,7 +214,7 @@ def open_session(path: Path, *, exclude: Collection[str] = (), skip_damaged: boo
     )
 
 
-def _white_name(info: SessionInfo, names: list[str]) -> str:
+def name_of_white(info: SessionInfo, names: list[str]) -> str:
     """The stated name of the white reference; if none is stated, that of the only capture named like a white."""
     stated = info.white_reference != SessionInfo.white_reference
     if stated or info.white_reference in (name.lower() for name in names):

@@ -8,7 +8,7 @@ import numpy as np
 
 from hsi_sc_nerf.calibration.detector import DIGITISER_LIMITS
 from hsi_sc_nerf.capture.instrument import CaptureFiles, list_captures
-from hsi_sc_nerf.capture.session import Capture, open_captures
+from hsi_sc_nerf.capture.session import Capture, name_of_white, open_captures
 from hsi_sc_nerf.capture.session_info import SESSION_INFO_NAME, SessionInfo, read_session_info
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.inspection.capture_checks import BLURRED, DARK_RED, SATURATED_RED, acquisition_day
@@ -54,11 +54,12 @@ class Watch:
         lines = []
         try:
             self._info = read_session_info(self.path / SESSION_INFO_NAME)
-            new = [files for files in list_captures(self.path).captures if files.name not in self._seen]
+            found = list_captures(self.path).captures
         except (InputError, OSError) as error:
             self.incomplete = waited_for
             return self._once(str(error))
-        for files in new:
+        white = name_of_white(self._info, [files.name for files in found]).lower()
+        for files in (files for files in found if files.name not in self._seen):
             opened = open_captures([files], self._info, self.path, self.incomplete)
             if not opened:
                 continue
@@ -67,8 +68,7 @@ class Watch:
                 continue
             self._seen.add(files.name)
             self.captures += 1
-            is_white = files.name.lower() == self._info.white_reference.lower()
-            lines.append(self._line(opened[0], self._info.marker_dictionary, is_white))
+            lines.append(self._line(opened[0], self._info.marker_dictionary, files.name.lower() == white))
         for name in self.incomplete if lines else ():
             if name in waited_for:
                 lines += self._once(f"{name}: NOT COMPLETE, {self.incomplete[name]}")
@@ -95,8 +95,10 @@ class Watch:
         if dark > DARK_RED:
             faults.append("too dark")
         if self._first is not None:
-            if capture.cube.shape != self._first.cube.shape:
-                faults.append(f"size {capture.cube.shape} is not {self._first.cube.shape}")
+            # A white may have other lines and samples.
+            size, usual = (other.cube.shape[2 if is_white else 0 :] for other in (capture, self._first))
+            if size != usual:
+                faults.append(f"size {size} is not {usual}")
             if acquisition_day(capture) != acquisition_day(self._first):
                 faults.append(f"taken on {acquisition_day(capture)}, not {acquisition_day(self._first)}")
         if not is_white:

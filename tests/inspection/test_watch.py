@@ -24,6 +24,17 @@ def test_a_line_for_each_new_capture_that_is_complete(tmp_path):
     assert watch.new_lines() == []
 
 
+def test_a_white_that_only_its_name_tells_of(tmp_path):
+    """As `process` finds it."""
+    watch = Watch(tmp_path)
+    write_one(tmp_path, "White_tile", np.full((SIZE_PX // 2, *IMAGE.shape[1:]), 0.98))
+    write_one(tmp_path, "fruit_0", IMAGE)
+    of_fruit, of_white = sorted(watch.new_lines(), key=str.lower)
+    assert "sharpness" in of_fruit
+    assert "sharpness" not in of_white
+    assert watch.flagged == []
+
+
 def test_a_capture_that_is_being_written_is_waited_for(tmp_path):
     watch = Watch(tmp_path)
     write_one(tmp_path, "fruit_0", IMAGE)
