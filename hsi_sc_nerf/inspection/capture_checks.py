@@ -16,7 +16,14 @@ from hsi_sc_nerf.findings import Finding, Level, leave_out, names_in_short
 from hsi_sc_nerf.inspection.quicklook import Quicklook, saturation_level
 from hsi_sc_nerf.poses.marker_detection import Detections
 
-_DAY = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}")
+_TIME = re.compile(r"\d+:\d+(:\d+)?")
+_DAY = re.compile(
+    r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}"  # 2018-06-21, 21.6.2018
+    r"|\d{1,2}[-/. ]+[a-z]{3,}[-/. ]+\d{4}"  # 21-Jun-2018
+    r"|[a-z]{3,}[. ]+\d{1,2}[, ]+\d{4}"  # Jun 21 2018
+    r"|\d{8}",  # 20180621
+    re.IGNORECASE,
+)
 SATURATED_AMBER, SATURATED_RED = 0.005, 0.25
 """Fractions of a frame's values that are saturated: highlights are flagged one by one; above the second limit the
 exposure is wrong."""
@@ -77,10 +84,10 @@ def check_files(session: Session, skip_damaged: bool = False) -> list[Finding]:
 
 
 def acquisition_day(capture: Capture) -> str | None:
-    """The day that the header states, as it writes it; None without one."""
-    text = str(capture.cube.fields.get("acquisition date", "")).strip()
-    match = _DAY.search(text)
-    return match.group() if match else text or None
+    """The day that the header states, as it writes it but without the time; None without one."""
+    text = _TIME.sub(" ", str(capture.cube.fields.get("acquisition date", "")))
+    match = _DAY.search(" ".join(text.split()))
+    return match.group() if match else None
 
 
 def _binning(capture: Capture) -> str | None:

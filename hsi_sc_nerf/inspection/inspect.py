@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -223,7 +224,7 @@ def draw_inspection(inspection: Inspection, path: Path) -> None:
                 fontsize=6,
                 va="top",
                 color="white",
-                bbox={"color": COLOURS[1] if name in red.replace(",", " ").split() else "0.2", "pad": 1},
+                bbox={"color": COLOURS[1] if is_named(name, red) else "0.2", "pad": 1},
             )
         for axes, (label, values) in zip(parts[1:], lines.items(), strict=True):
             axes.plot(values, marker=".", color=COLOURS[0])
@@ -232,6 +233,11 @@ def draw_inspection(inspection: Inspection, path: Path) -> None:
             labels = [names[index] for index in shown] if axes is parts[-1] else []
             axes.set_xticks(list(shown), labels or [""] * len(shown), rotation=30, ha="right", fontsize=7)
         save_figure(figure, path)
+
+
+def is_named(name: str, sentences: str) -> bool:
+    """Whether sentences name a capture, not only one whose name begins or ends with the same letters."""
+    return re.search(rf"(?<![^\s'(]){re.escape(name)}(?![\w-]|\.\w)", sentences) is not None
 
 
 def _thumbnail(picture: np.ndarray) -> np.ndarray:

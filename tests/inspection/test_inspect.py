@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,8 +23,8 @@ from inspection_session import (
 from hsi_sc_nerf.capture.envi import open_cube, write_cube
 from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.findings import Finding
-from hsi_sc_nerf.inspection.capture_checks import check_frames
-from hsi_sc_nerf.inspection.inspect import Inspection, draw_inspection, inspect_session
+from hsi_sc_nerf.inspection.capture_checks import acquisition_day, check_frames
+from hsi_sc_nerf.inspection.inspect import Inspection, draw_inspection, inspect_session, is_named
 
 
 def inspect(path: Path) -> tuple[Inspection, dict[str, Finding]]:
@@ -63,6 +64,33 @@ def test_frames_of_another_day(session):
     red = found(session, "red")
     for part in ("fruit_05, fruit_06", "15-02-2021", "--exclude fruit_05 --exclude fruit_06"):
         assert part in red["dates"]
+
+
+@pytest.mark.parametrize(
+    ("stated", "day"),
+    [
+        ("DATE(yyyy-mm-dd): 2018-06-21", "2018-06-21"),
+        ("2018-06-21T10:11:12", "2018-06-21"),
+        ("6/21/2018 10:11", "6/21/2018"),
+        ("21-Jun-2018 10:11:12", "21-Jun-2018"),
+        ("Thu Jun 21 10:11:12 2018", "Jun 21 2018"),
+        ("20180621 101112", "20180621"),
+        ("10:11:12", None),
+        ("", None),
+    ],
+)
+def test_the_day_without_the_time(stated, day):
+    capture = SimpleNamespace(cube=SimpleNamespace(fields={"acquisition date": stated}))
+    assert acquisition_day(capture) == day
+
+
+@pytest.mark.parametrize(
+    ("name", "named"),
+    [("fruit_1", True), ("plum 2", True), ("fruit_3", True), ("fruit", False), ("fruit_10", False), ("3", False)],
+)
+def test_frames_that_red_findings_name_are_marked(name, named):
+    sentences = "S: another object: fruit_1, plum 2; leave out with --exclude fruit_1 --exclude 'plum 2'. fruit_3."
+    assert is_named(name, sentences) == named
 
 
 def test_another_object_on_the_same_day(session):
