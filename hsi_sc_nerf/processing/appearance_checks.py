@@ -127,6 +127,8 @@ def _frames_slip(
 ) -> list[Finding]:
     """Successive frames whose points match better where the object is turned on the disc between them."""
     numbers = [number for number in np.unique(views.frame) if names[number] not in shaded]
+    if len(numbers) < LEAST_FRAMES:
+        return []
     pairs = list(zip(numbers, [*numbers[1:], numbers[0]], strict=True))
     by_frame = {number: np.flatnonzero(views.frame == number) for number in numbers}
     scatter = _scatter(views, channels, [(by_frame[a], by_frame[b]) for a, b in pairs])

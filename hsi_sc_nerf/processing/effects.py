@@ -124,7 +124,8 @@ def pose_refinement(poses: TurntablePoses, object_box_m: Float[np.ndarray, "2 3"
         sentence = f"The uncertainty of the poses is not known; for poses by {poses.method}, {what}."
         return EffectEvidence("pose_refinement", refined, None, None, None, "px", sentence)
     radius_m = float(np.abs(object_box_m[:, :2]).max())
-    distance_m = float(np.linalg.norm(poses.camera_to_world[poses.used, :2, 3], axis=1).mean())
+    cameras_m = poses.camera_to_world[poses.used, :3, 3]
+    distance_m = float(np.linalg.norm(cameras_m - object_box_m.mean(axis=0), axis=1).mean())
     error_px = poses.intrinsics.fl_x / distance_m * radius_m * np.deg2rad(poses.uncertainty.rotation_deg)
     return _decided(
         *("pose_refinement", float(error_px), 0.0, LEAST_POSE_ERROR_PX, "px"),
@@ -186,7 +187,10 @@ def spectral_rank(dataset: PackedDataset) -> EffectEvidence:
     except InputError:
         sentence = "Too few spectra are free of flagged values to determine the rank."
         return EffectEvidence("spectral_rank", False, None, None, None, "spectra", sentence)
-    sentence = f"{rank} spectra span those of all {bands} bands above the noise, and the field emits {rank} numbers."
+    sentence = (
+        f"All pixels are mixtures of {rank} spectra to within the noise, so the model learns {rank} numbers at each "
+        f"point instead of {bands}."
+    )
     return EffectEvidence("spectral_rank", rank < bands, float(rank), None, 1.0, "spectra", sentence)
 
 

@@ -100,6 +100,12 @@ def test_a_lamp_that_fails_in_the_middle():
     assert "again" in findings["frames-light"].sentence
 
 
+def test_every_other_frame_in_other_light():
+    """None is usual, and none is left to look for slips in."""
+    findings = found(light=lambda facing, frame: 1.0 if frame % 2 else 0.5)
+    assert list(findings["frames-light"].values) == NAMES
+
+
 @pytest.mark.parametrize("slip_deg", [12.0, -15.0])
 @pytest.mark.parametrize("noise", [0.01, 0.06])
 def test_an_object_that_slipped(slip_deg, noise):

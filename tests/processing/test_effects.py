@@ -57,12 +57,15 @@ def test_uncertain_poses_are_refined_by_what_they_move_the_surface():
     method = pose_refinement(poses(), BOX_M)
     assert (method.present, method.evidence) == (False, None)
     assert pose_refinement(poses(method="angles"), BOX_M).present
-    distance_m = 0.4
-    one_px_deg = np.rad2deg(distance_m / (factory.INTRINSICS.fl_x * 0.04))
-    effect = pose_refinement(poses(uncertainty=stated(one_px_deg)), BOX_M)
-    assert effect.evidence == pytest.approx(1.0)
+    one_px_deg = np.rad2deg(0.4 / (factory.INTRINSICS.fl_x * 0.04))
+    centre_m = BOX_M.mean(axis=0)
+    for elevation in np.deg2rad([0.0, 75.0]):
+        cameras = np.tile(np.eye(4), (4, 1, 1))
+        cameras[:, :3, 3] = centre_m + 0.4 * np.array([np.cos(elevation), 0.0, np.sin(elevation)])
+        effect = pose_refinement(poses(camera_to_world=cameras, uncertainty=stated(one_px_deg)), BOX_M)
+        assert effect.evidence == pytest.approx(1.0)
     for factor in (0.9, 1.1):
-        uncertain = poses(uncertainty=stated(factor * LEAST_POSE_ERROR_PX * one_px_deg))
+        uncertain = poses(camera_to_world=cameras, uncertainty=stated(factor * LEAST_POSE_ERROR_PX * one_px_deg))
         assert pose_refinement(uncertain, BOX_M).present == (factor > 1.0)
 
 
