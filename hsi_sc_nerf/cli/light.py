@@ -115,10 +115,16 @@ def sentences(told: dict[str, Any]) -> list[str]:
     evidence, std = told["evidence"], told["relative_std"]
     decided = "the material's columns are corrected" if told["corrected"] else "nothing is corrected"
     lines = [
-        f"{'Uneven light is found' if told['shaded'] else 'No uneven light is found beyond noise'}; {decided} "
-        f"(like spectra are as bright as the light says by the factor {evidence['profile']:.2f} ± "
-        f"{evidence['profile_std']:.2f}; 1 is right, 0 is even light)."
+        f"{'Uneven light is found' if told['shaded'] else 'No uneven light is found beyond noise'}; {decided}. "
+        f"Between points of similar spectra, brightness differs {evidence['profile']:.2f} ± "
+        f"{evidence['profile_std']:.2f} times as much as the light that was found predicts; 1 means that the light "
+        "is right, 0 that the light is even."
     ]
+    if told.get("support_unknown"):
+        lines.append(
+            "Warning: the container is not known, so the shade of what the object stands on is left out; state "
+            "container_diameter_m and container_height_m in session.json, and process the session again."
+        )
     if told.get("light_from") is not None and abs(evidence["turning"] - 1.0) > OTHER_LIGHT:
         lines.append(
             f"Warning: brightness changes from view to view by {evidence['turning']:.2f} times what the light of "
@@ -148,6 +154,7 @@ def light_summary(
         "evidence": asdict(found.evidence),
         "relative_std": float(np.median(std / irradiance)) if np.isfinite(std).all() else None,
         "light_from": None if light_from is None else str(light_from),
+        "support_unknown": found.support_unknown,
         "scatter": found.light.fit.scatter,
         "light": found.stationary.values(),
     }

@@ -36,6 +36,9 @@ SMOOTHING_M = 0.003
 """Normals and light are means over this radius: the mesh is rough by its voxels, and pixels show no more."""
 LEAST_VIEWS = 200
 """Fewer measurements do not determine the light."""
+STANDS_ON_DISC_M = 0.01
+"""Largest height of the lower side of an object's box over the disc if it stands on the disc itself: its shaded
+underside may be missing from the masks."""
 LEAST_UNEVENNESS = 0.01
 """Irradiance that varies by less over the object changes no result."""
 
@@ -59,6 +62,12 @@ class RunLight:
     evidence: ShadingEvidence
     renders: DepthRenders
     mesh: SurfaceMesh
+
+    @property
+    def support_unknown(self) -> bool:
+        """Whether the object stands above the disc on something of unknown size, whose shade is left out."""
+        dataset = self.run.dataset
+        return dataset.container is None and bool(dataset.object_box_m[0, 2] > STANDS_ON_DISC_M)
 
     def irradiance(
         self, points_m: Float[np.ndarray, "n 3"]

@@ -1,6 +1,7 @@
 """The light on a run's object, the command, and what tells of shading: balls of known irradiance."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import ball_run
 import capture_factory as factory
@@ -19,10 +20,10 @@ from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.geometry.camera import pixel_rays
 from hsi_sc_nerf.light.fit import fit_light
 from hsi_sc_nerf.light.known_light import read_light
-from hsi_sc_nerf.light.of_run import light_of_run, shading_evidence
+from hsi_sc_nerf.light.of_run import RunLight, light_of_run, shading_evidence
 from hsi_sc_nerf.models.trained_run import open_trained_run
 from hsi_sc_nerf.packed.cube import pack, write_packed_cube
-from hsi_sc_nerf.packed.dataset import open_packed
+from hsi_sc_nerf.packed.dataset import Container, open_packed
 
 TO_LAMP = np.array([-0.45, 0.3, 0.84]) / np.linalg.norm([-0.45, 0.3, 0.84])
 LAMP = 0.5
@@ -102,6 +103,7 @@ def test_a_lamp_on_a_run_is_found_and_divided_out(lit):
     told = light_summary(lit, corrected, corrected=True)
     assert told["shaded"] is True
     assert told["relative_std"] == pytest.approx(np.median(std / by_band.mean(axis=1)), rel=1e-4)
+    assert told["support_unknown"] is True
 
 
 @pytest.mark.slow
@@ -164,6 +166,20 @@ def test_the_light_of_another_chamber_is_warned_of(turning, light_from, warned):
     evidence = {"profile": 0.7, "profile_std": 0.1, "turning": turning}
     told = {"evidence": evidence, "shaded": True, "corrected": True, "relative_std": 0.02, "light_from": light_from}
     assert sum("b.json" in line for line in sentences(told)) == warned
+
+
+@pytest.mark.parametrize(
+    ("container", "lowest_m", "warned"), [(None, 0.07, 1), (None, 0.001, 0), (Container(0.09, 0.07), 0.07, 0)]
+)
+def test_an_unknown_container_is_warned_of(container, lowest_m, warned):
+    dataset = SimpleNamespace(
+        container=container, object_box_m=np.array([[-0.04, -0.04, lowest_m], [0.04, 0.04, 0.2]])
+    )
+    found = RunLight(SimpleNamespace(dataset=dataset), *[None] * 5)
+    evidence = {"profile": 0.7, "profile_std": 0.1}
+    told = {"evidence": evidence, "shaded": True, "corrected": True, "relative_std": 0.02}
+    lines = sentences({**told, "support_unknown": found.support_unknown})
+    assert sum("container_height_m" in line for line in lines if line.startswith("Warning")) == warned
 
 
 @pytest.mark.slow
