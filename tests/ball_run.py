@@ -18,6 +18,7 @@ from hsi_sc_nerf.files import write_png
 from hsi_sc_nerf.models.checkpoints import checkpoint_path, write_checkpoint
 from hsi_sc_nerf.packed.cube import pack, write_packed_cube
 from hsi_sc_nerf.packed.dataset import PackedDataset, write_transforms
+from hsi_sc_nerf.processing.painted_masks import note_masks
 
 ANGLES_DEG = np.arange(0.0, 360.0, 36.0)
 DENSITY = 400.0  # opaque within some hundredths of the scene's unit
@@ -37,22 +38,22 @@ def write_ball_dataset(root: Path) -> Path:
         frames.append(frame)
     reach = np.full(3, factory.SPHERE_RADIUS_M)
     box = np.stack([factory.SPHERE_CENTRE_M - reach, factory.SPHERE_CENTRE_M + reach])
-    write_transforms(
-        PackedDataset(
-            root=root,
-            intrinsics=factory.INTRINSICS,
-            distortion=np.zeros(4),
-            wavelengths_nm=factory.WAVELENGTHS_NM,
-            pseudo_rgb_nm=factory.WAVELENGTHS_NM[[5, 3, 1]],
-            object_name="ball",
-            scene_box_m=np.array([[-0.06, -0.06, 0.0], [0.06, 0.06, 0.16]]),
-            object_box_m=box,
-            background_reflectance=np.full(factory.BANDS, factory.BACKGROUND),
-            container=None,
-            fwhm_nm=np.full(factory.BANDS, 7.0),
-            frames=tuple(frames),
-        )
+    dataset = PackedDataset(
+        root=root,
+        intrinsics=factory.INTRINSICS,
+        distortion=np.zeros(4),
+        wavelengths_nm=factory.WAVELENGTHS_NM,
+        pseudo_rgb_nm=factory.WAVELENGTHS_NM[[5, 3, 1]],
+        object_name="ball",
+        scene_box_m=np.array([[-0.06, -0.06, 0.0], [0.06, 0.06, 0.16]]),
+        object_box_m=box,
+        background_reflectance=np.full(factory.BANDS, factory.BACKGROUND),
+        container=None,
+        fwhm_nm=np.full(factory.BANDS, 7.0),
+        frames=tuple(frames),
     )
+    note_masks(dataset)
+    write_transforms(dataset)
     return root
 
 

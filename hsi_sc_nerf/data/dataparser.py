@@ -11,12 +11,14 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+import tyro
 from jaxtyping import Float, Int
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fraction
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from nerfstudio.utils.rich_utils import CONSOLE
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.capture.session import is_session
@@ -24,6 +26,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.packed.dataset import PackedDataset, open_packed, transforms_path
+from hsi_sc_nerf.processing.painted_masks import painted_box, with_object_box
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
 from hsi_sc_nerf.spectra import nearest_bands
 from hsi_sc_nerf.terminal import ignore_library_warnings
@@ -51,6 +54,9 @@ class SpectralDataParserConfig(DataParserConfig):
     positions around the object, as nerfstudio scales scenes without bounds (the paper's preset)."""
     process: ProcessConfig = field(default_factory=ProcessConfig)
     """How to process a session."""
+    object_box_m: tyro.conf.Suppress[tuple[tuple[float, float, float], tuple[float, float, float]] | None] = None
+    """Box of the object in this run, found when training starts, where painted masks show more than the dataset's box
+    holds."""
 
 
 class SpectralDataparserOutputs(DataparserOutputs):
@@ -74,10 +80,11 @@ class SpectralDataParser(DataParser):
             raise SystemExit(f"hsi-sc-nerf: {error}") from error
 
     def _open(self) -> PackedDataset:
-        data = self.config.data
+        data, box_m = self.config.data, self.config.object_box_m
         if is_unprocessed(data):
-            return open_packed(process_session(data, processed_dir(data.resolve()), self.config.process))
-        return open_packed(data)
+            data = process_session(data, processed_dir(data.resolve()), self.config.process)
+        dataset = open_packed(data)
+        return dataset if box_m is None else with_object_box(dataset, np.array(box_m))
 
     def _outputs(self, dataset: PackedDataset, split: str) -> DataparserOutputs:
         num_frames = len(dataset.frames)
@@ -152,17 +159,33 @@ def pinhole_cameras(
 
 
 def require_data(manager: Any) -> None:
-    """Refuse, before a run's folder is made, data that are neither a dataset nor a session.
+    """Refuse, before a run's folder is made, data that are neither a dataset nor a session; read painted masks.
 
     Args:
-        manager: configuration of the data manager.
+        manager: configuration of the data manager; it gets the object's box of painted masks, which evaluation and
+            export use as well, whatever becomes of the dataset.
 
     Raises:
         InputError: they are neither, or a dataset that cannot be read.
     """
     data = manager.data or manager.dataparser.data
-    if not is_unprocessed(data):
-        open_packed(data)
+    dataset = _processed_before(data) if is_unprocessed(data) else open_packed(data)
+    box_m = None if dataset is None else painted_box(dataset)
+    found = None if box_m is None else tuple(map(tuple, box_m.tolist()))
+    if dataset is not None and box_m is not None and found != manager.dataparser.object_box_m:
+        size_mm = " x ".join(f"{1000.0 * side:.0f}" for side in np.diff(box_m, axis=0)[0])
+        CONSOLE.print(
+            f"{dataset.root}: painted masks show more; the box of the object is {size_mm} mm.", markup=False
+        )
+    manager.dataparser.object_box_m = found
+
+
+def _processed_before(session_dir: Path) -> PackedDataset | None:
+    """The dataset of a session; None if it is to be made, or made again."""
+    try:
+        return open_packed(processed_dir(session_dir.resolve()))
+    except InputError:
+        return None
 
 
 def is_unprocessed(data: Path) -> bool:

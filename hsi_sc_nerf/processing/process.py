@@ -44,6 +44,7 @@ from hsi_sc_nerf.processing.frames import (
 )
 from hsi_sc_nerf.processing.mask_checks import check_masks
 from hsi_sc_nerf.processing.masks import MaskConfig, above_lid, foreground_masks, lid_middle, mask_picture
+from hsi_sc_nerf.processing.painted_masks import note_masks
 from hsi_sc_nerf.processing.posed_frames import PoseFunction, container_under, known_camera, pose_frames, posed_frames
 from hsi_sc_nerf.processing.session_checks import SessionChecks, require_checks
 from hsi_sc_nerf.processing.visual_hull import VotedHull, assumed_disc, object_box, scene_box, voted_hull
@@ -198,6 +199,7 @@ def process_session(
         effects = measure_effects(dataset, bins, masks, seen, drift, poses)
         draw_effects(output_dir / "report" / "effects.png", effects)
     show_effects(console, effects)
+    note_masks(dataset)
     write_transforms(replace(dataset, effects=effects))
     console.print(f"{output_dir}: {len(frames)} frames are ready to train on.")
     return output_dir

@@ -5,12 +5,17 @@ import copy
 import numpy as np
 import pytest
 import torch
+from ball_run import write_ball_dataset
+from painted_stem import paint_stem
 
 from hsi_sc_nerf.config import hsi_sc_nerf
 from hsi_sc_nerf.data.datamanager import SpectralDataset
 from hsi_sc_nerf.data.dataparser import SpectralDataParserConfig, scene_scaling, split_frames
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.models.run_settings import read_config
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE
+from hsi_sc_nerf.packed.dataset import open_packed
+from hsi_sc_nerf.processing.painted_masks import note_masks
 
 
 @pytest.mark.parametrize("num_frames", [2, 3, 8, 10, 36, 60])
@@ -53,6 +58,27 @@ def test_data_is_refused_before_a_run_has_a_folder_and_a_damaged_dataset_is_no_s
         with pytest.raises(SystemExit, match=told):
             SpectralDataParserConfig(data=data).setup().get_dataparser_outputs("train")
     assert not config.output_dir.exists()
+
+
+def test_what_painted_masks_add_is_inside_the_boxes_of_the_run_alone(tmp_path):
+    data = write_ball_dataset(tmp_path / "data")
+    processed, before = open_packed(data), (data / "transforms.json").read_bytes()
+    top_m = paint_stem(processed)
+    config = copy.deepcopy(hsi_sc_nerf.config)
+    config.output_dir, config.experiment_name, config.timestamp = tmp_path / "runs", "x", "run"
+    config.pipeline.datamanager.data = config.pipeline.datamanager.dataparser.data = data
+    config.save_config()
+    assert (data / "transforms.json").read_bytes() == before
+    stored = read_config(config.get_base_dir() / "config.yml").pipeline.datamanager.dataparser
+    for parser in (config.pipeline.datamanager.dataparser, stored):  # of the training, and of what is done afterwards
+        dataset = parser.setup().get_dataparser_outputs("train").metadata["dataset"]
+        assert dataset.object_box_m[1, 2] > top_m
+        assert dataset.scene_box_m[1, 2] > dataset.object_box_m[1, 2]
+    assert np.ptp(dataset.object_box_m[:, :2]) == pytest.approx(np.ptp(processed.object_box_m[:, :2]), abs=0.02)
+    # Another training, of masks that count as those of `process`.
+    note_masks(processed)
+    config.save_config()
+    assert config.pipeline.datamanager.dataparser.object_box_m is None
 
 
 def test_the_scene_fills_the_models_cube():

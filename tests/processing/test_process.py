@@ -36,6 +36,7 @@ from hsi_sc_nerf.packed.dataset import Container, open_packed
 from hsi_sc_nerf.processing import process
 from hsi_sc_nerf.processing.frames import pack_frames
 from hsi_sc_nerf.processing.masks import MaskConfig, foreground_masks
+from hsi_sc_nerf.processing.painted_masks import painted_box
 from hsi_sc_nerf.processing.posed_frames import known_camera
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
 
@@ -138,6 +139,10 @@ def test_session_to_dataset(tmp_path, specim):
     for picture in ("white_reference", "masks", "poses"):
         assert cv2.imread(str(output / "report" / f"{picture}.png")).std() > 1.0
     assert json.loads((output / "poses.json").read_text())["marker_dictionary"] == "DICT_5X5_50"
+    (note,) = output.glob(".cache/masks*")
+    assert painted_box(dataset) is None
+    note.unlink()
+    assert painted_box(dataset) is None  # after a look at the masks
     assert not [path for path in output.rglob("*") if "partial" in path.name]
 
 
