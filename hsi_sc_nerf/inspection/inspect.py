@@ -79,8 +79,8 @@ def inspect_session(
         skip_damaged: whether the user leaves damaged captures out.
 
     Raises:
-        InputError: the session cannot be opened or does not have that source of white, or a cube or the panel cannot be
-            read.
+        InputError: the session cannot be opened or does not have that source of white, or a cube or the panel
+            cannot be read.
 
     Example:
         >>> inspection = inspect_session("captures")
