@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from rich.console import Console
 
 from hsi_sc_nerf import paper
@@ -29,7 +30,7 @@ from hsi_sc_nerf.analysis.size import (
 )
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh, with_spectra
 from hsi_sc_nerf.analysis.standing_pieces import one_piece
-from hsi_sc_nerf.analysis.traits import RegionOfInterest, Traits, analyse, classified
+from hsi_sc_nerf.analysis.traits import WHOLE, RegionOfInterest, Traits, analyse, classified
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, SpectralCloud
 from hsi_sc_nerf.indices.catalogue import find_indices
@@ -114,7 +115,8 @@ def measure_traits(
         >>> found.size.volume_l, found.traits.regions[0].maps["PRI"].surface.mean
         (0.21, 0.04)
     """
-    names = [*(regions or ()), *(one.name for one in drawn_regions), *(set(library.names) if library else ())]
+    of_classes = set(library.names if library else ()) | {WHOLE}
+    names = [*(regions or ()), *(one.name for one in drawn_regions), *of_classes]
     if twice := [name for name in names if names.count(name) > 1]:
         raise InputError(f"two regions or classes are named {twice[0]}; give each region a name of its own.")
     config = on_container(MeshConfig() if mesh is None else mesh, dataset)
@@ -125,7 +127,7 @@ def measure_traits(
     for calibration in read:
         calibration.interpolation(cloud.wavelengths_nm)  # which refuses before the work
     if library is not None:
-        library = library.at(cloud.wavelengths_nm)
+        library = class_references(library, cloud.wavelengths_nm)
 
     console = Console(stderr=True)
     with console.status("closing the surface"):
@@ -148,6 +150,23 @@ def measure_traits(
         unsupervised = find_components(surface, components) if components else None
     settings = {**asdict(config), "splits": splits, "max_incidence_deg": max_incidence_deg}
     return Measurement(surface, size_of(closed), uncertainty, traits, unsupervised, settings)
+
+
+def class_references(library: SpectralLibrary, wavelengths_nm: Float[np.ndarray, "bands"]) -> SpectralLibrary:
+    """The spectra of a library that classes are made of, at the bands of a cloud.
+
+    ``regions.sli`` also holds the mean of the whole surface, which is no class and is left out.
+
+    Raises:
+        InputError: nothing else is in the library, or it does not cover the bands.
+    """
+    names = tuple(name for name in library.names if name != WHOLE)
+    if not names:
+        raise InputError(
+            f"the spectral library has only the mean of the {WHOLE}, which is no class; give one with spectra of "
+            "classes, such as the regions.sli of an object with regions (--roi)."
+        )
+    return library.only(names).at(wavelengths_nm)
 
 
 def on_container(mesh: MeshConfig, dataset: PackedDataset | None) -> MeshConfig:

@@ -81,6 +81,7 @@ class ChangeCommand:
         from hsi_sc_nerf.analysis.change_days import days_on_one_mesh
         from hsi_sc_nerf.analysis.change_maps import BRIGHTNESS, CLASSES, SPECTRUM, require_own_names
         from hsi_sc_nerf.analysis.library import read_library
+        from hsi_sc_nerf.analysis.measurement import class_references
         from hsi_sc_nerf.analysis.pictures import SideViews
         from hsi_sc_nerf.indices.catalogue import find_indices
 
@@ -104,7 +105,7 @@ class ChangeCommand:
         indices = find_indices(self.index, clouds[0].wavelengths_nm)
         require_own_names(self.band_nm, indices)
         if library is not None:
-            library = library.at(clouds[0].wavelengths_nm)
+            library = class_references(library, clouds[0].wavelengths_nm)
         days = days_on_one_mesh(
             clouds,
             names,

@@ -5,6 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from known_fruit import NM as FRUIT_NM
+from known_fruit import SKIN, fruit_cloud
 from true_object import TrueObject, relative_rms
 
 from hsi_sc_nerf.analysis import report
@@ -14,9 +16,10 @@ from hsi_sc_nerf.analysis.classes import (
     connected_regions,
     spectral_angles,
 )
+from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
 from hsi_sc_nerf.analysis.library import SpectralLibrary
 from hsi_sc_nerf.analysis.maps import SurfaceMap, index_maps
-from hsi_sc_nerf.analysis.measurement import measure_traits
+from hsi_sc_nerf.analysis.measurement import class_references, measure_traits
 from hsi_sc_nerf.analysis.measurement_files import write_spectra
 from hsi_sc_nerf.analysis.pictures import SideViews
 from hsi_sc_nerf.analysis.report import trait_tables
@@ -276,6 +279,28 @@ def test_a_region_with_the_name_of_a_class_is_refused_before_the_cloud_is_looked
     library = SpectralLibrary(("skin", "bruise", "bruise"), NM, np.ones((3, len(NM))))
     with pytest.raises(InputError, match="two regions or classes are named bruise"):
         measure_traits(None, library=library, regions={"bruise": (0.0, 0.0, 0.0, 0.01)})
+
+
+@pytest.mark.slow
+def test_the_whole_surface_in_a_library_is_no_class():
+    """As in the regions.sli of another object, which has its mean beside those of its classes and regions."""
+    from_traits = SpectralLibrary(
+        (*LIBRARY.names, WHOLE), NM, np.vstack([LIBRARY.spectra, LIBRARY.spectra.mean(axis=0)])
+    )
+    assert class_references(from_traits, NM).names == LIBRARY.names
+    cloud = fruit_cloud(count=4000)
+    config = MeshConfig(octree_depth=5, smoothing_radius_m=0.004)
+    library = SpectralLibrary(("skin", WHOLE), FRUIT_NM, np.stack([SKIN, SKIN]))
+    alone, beside = (measure_traits(cloud, splits=0, mesh=config, library=given) for given in (None, library))
+    assert beside.traits.classes.names == ("skin",)
+    assert beside.traits.seen_m2 == alone.traits.seen_m2
+    np.testing.assert_array_equal(
+        beside.region_spectra().spectra[0], alone.region_spectra().spectra[0], err_msg="the whole surface"
+    )
+    with pytest.raises(InputError, match="only the mean of the whole surface"):
+        measure_traits(cloud, library=SpectralLibrary((WHOLE,), FRUIT_NM, SKIN[None]))
+    with pytest.raises(InputError, match="are named whole surface"):
+        measure_traits(None, regions={WHOLE: (0.0, 0.0, 0.0, 0.01)})
 
 
 def test_regions_off_the_surface_or_of_one_name_are_refused():
