@@ -60,7 +60,9 @@ COLUMNS: dict[str, tuple[str, str]] = {
 """CF unit and meaning of each column that this package writes, the bands' apart."""
 _GEOMETRY = ("x", "y", "z", "nx", "ny", "nz")
 _CHANNELS = ("red", "green", "blue")
+_MEASURED = {*COLUMNS} - {*_GEOMETRY, *_CHANNELS}
 _BAND_NAME = re.compile(r"scalar_(\d+(?:\.\d+)?)nm")
+_MATERIAL_NAME = re.compile(r"material_\d+(?:\.\d+)?nm")
 
 
 @dataclass(frozen=True)
@@ -261,8 +263,20 @@ def material_spectra(cloud: SpectralCloud) -> Float[np.ndarray, "n bands"] | Non
     return np.stack([cloud.extra[name] for name in names], axis=1)
 
 
+def own_name(name: str) -> str:
+    """The name by which this package wrote a column; CloudCompare saves ``views`` as ``scalar_views``."""
+    short = name.removeprefix("scalar_")
+    return short if short in _MEASURED or _MATERIAL_NAME.fullmatch(short) else name
+
+
+def is_of_a_run(name: str) -> bool:
+    """Whether a PLY file's property holds what a run measured; positions, normals and colours may be a scanner's."""
+    name = own_name(name)
+    return name in _MEASURED or any(pattern.fullmatch(name) for pattern in (_BAND_NAME, _MATERIAL_NAME))
+
+
 def read_spectral_ply(path: Path | str) -> SpectralCloud:
-    """Read a cloud that `write_spectral_ply` wrote, its properties in any order (CloudCompare reorders them).
+    """Read a cloud that `write_spectral_ply` wrote, its properties in any order and as CloudCompare names them.
 
     Raises:
         InputError: the file is missing, is no readable PLY, or lacks positions, normals, colours or spectral bands.
@@ -292,7 +306,7 @@ def read_spectral_ply(path: Path | str) -> SpectralCloud:
         spectra=columns(tuple(bands), np.float32),
         wavelengths_nm=np.array(list(bands.values())),
         extra={
-            name: np.array(vertices[name], np.float32)
+            own_name(name): np.array(vertices[name], np.float32)
             for name in names
             if name not in bands and name not in (*_GEOMETRY, *_CHANNELS)
         },

@@ -3,7 +3,7 @@
 Spectra depend on the viewing direction, and the model knows only the directions that it was trained on; no camera
 looked along the normal of an upward face. So each point gets the mean spectrum over its most frontal training
 cameras, at less than ``MAX_INCIDENCE_DEG``. Only rays that end at the point count, not those that end at an occluder
-before it or behind it. Everything else in the file is kept.
+before it or behind it. Everything else in the file is kept, but for columns that another run measured.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ from hsi_sc_nerf.export.cloud import (
     band_property_names,
     comment_lines,
     estimate_normals,
+    is_of_a_run,
+    own_name,
 )
 from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project
@@ -249,6 +251,9 @@ def write_sampled_ply(
 ) -> None:
     """Write a file with the spectra of its points as binary PLY, and normals and pseudo-RGB if it has none.
 
+    All else in the file is kept, but for the columns that a run had measured, such as those of the material: beside
+    the new spectra they would be taken for theirs.
+
     Its comments state ``run``, the name of the run, and what the new columns mean. ``material`` is the reflectance of
     the material, and the relative standard deviation of the light (`CloudMaterial.at`).
 
@@ -271,11 +276,16 @@ def write_sampled_ply(
         known = np.isfinite(colours)
         colours = np.where(known, to_8_bit(np.where(known, colours, 0.0)), np.uint8(_NO_SPECTRUM_GREY))
         columns |= zip(_COLOUR, colours.T, strict=True)
-    kept = {name: vertices[name] for name in vertices.dtype.names if name not in columns}
+    earlier = [name for name in vertices.dtype.names if is_of_a_run(name)]
+    kept = {name: vertices[name] for name in vertices.dtype.names if name not in (*columns, *earlier)}
     vertex = ply_vertices(kept | columns)
     elements = [vertex if element.name == "vertex" else element for element in content.elements]
     added = comment_lines([name for name in columns if name not in ("x", "y", "z")], run)
-    comments = [*content.comments, *(line for line in added if line not in content.comments)]
+    of_file = content.comments
+    if earlier:
+        outdated = comment_lines(map(own_name, earlier))
+        of_file = [line for line in of_file if line not in outdated and not line.startswith("run: ")]
+    comments = [*of_file, *(line for line in added if line not in of_file)]
     with atomic_write(path) as (temporary,):
         file = PlyData(elements, byte_order="<", comments=comments, obj_info=content.obj_info)
         file.write(str(temporary))

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,16 +12,19 @@ from known_fruit import CAP_CM2, SKIN, fruit_cloud
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
 from hsi_sc_nerf.api.clouds import read_cloud
 from hsi_sc_nerf.cli.clouds import TraitsCommand
-from hsi_sc_nerf.export.cloud import write_spectral_ply
+from hsi_sc_nerf.export.cloud import INCIDENCE, write_spectral_ply
 
 QUICK = {"splits": 0, "mesh": MeshConfig(octree_depth=6)}
 
 
 @pytest.mark.slow
 def test_proposed_organs_are_written_and_measured(tmp_path, capfd):
-    write_spectral_ply(tmp_path / "fruit.ply", fruit_cloud())
+    cloud = fruit_cloud()
+    write_spectral_ply(tmp_path / "fruit.ply", replace(cloud, extra={INCIDENCE: np.zeros(len(cloud))}))
     TraitsCommand(tmp_path / "fruit.ply", tmp_path / "out", propose_regions=True, **QUICK).main()
-    assert "body, stem, calyx" in capfd.readouterr().err
+    told = capfd.readouterr().err
+    assert "body, stem, calyx" in told
+    assert INCIDENCE not in told
     proposed = tmp_path / "out" / "regions_proposed.json"
     TraitsCommand(tmp_path / "fruit.ply", tmp_path / "again", roi_file=proposed, **QUICK).main()
     regions = json.loads((tmp_path / "again" / "traits.json").read_text())["regions"]
@@ -33,7 +37,9 @@ def test_where_nothing_differs_one_sentence_says_so(tmp_path, capfd):
     cloud = fruit_cloud(stem=SKIN, cap=SKIN, count=8000)
     write_spectral_ply(tmp_path / "ball.ply", cloud.select(np.arange(8000)))
     TraitsCommand(tmp_path / "ball.ply", tmp_path, propose_regions=True, **QUICK).main()
-    assert "body alone" in capfd.readouterr().err
+    told = capfd.readouterr().err
+    assert "body alone" in told
+    assert f"no {INCIDENCE}" in told
     (body,) = json.loads((tmp_path / "regions_proposed.json").read_text())["regions"]
     assert len(body["points"]) == 8000
 

@@ -4,11 +4,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from plyfile import PlyData
-from random_cloud import BAND_NAMES, assert_equal, random_cloud
+from random_cloud import BAND_NAMES, WAVELENGTHS_NM, assert_equal, random_cloud
 
 from hsi_sc_nerf import __version__
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.cloud import band_property_names, read_spectral_ply, stream, write_spectral_ply
+from hsi_sc_nerf.export.cloud import (
+    INCIDENCE,
+    LIGHT_COLUMNS,
+    band_property_names,
+    material_spectra,
+    read_spectral_ply,
+    stream,
+    write_spectral_ply,
+)
 from hsi_sc_nerf.geometry.ply_file import ply_triangles
 
 
@@ -63,6 +71,21 @@ def test_open3d_reads_it_and_its_copy_reads_back(tmp_path: Path) -> None:
     np.testing.assert_array_equal(tensor.point["scalar_650.00nm"].numpy()[:, 0], written.spectra[:, 2])
     open3d.t.io.write_point_cloud(str(copy), tensor)  # in another order
     assert_equal(read_spectral_ply(copy), written)
+
+
+def test_a_copy_by_cloudcompare_keeps_material_and_incidence(tmp_path: Path) -> None:
+    """It saves each scalar field as ``scalar_`` and its name."""
+    columns = (INCIDENCE, *LIGHT_COLUMNS, *band_property_names(WAVELENGTHS_NM, "material"))
+    extra = {name: np.full(50, number, np.float32) for number, name in enumerate(columns)}
+    written, path = random_cloud(extra=extra), tmp_path / "cloud.ply"
+    write_spectral_ply(path, replace(written, extra=extra | {"quality": np.ones(50, np.float32)}))
+    content = path.read_bytes()
+    for name in (*columns, "quality"):
+        content = content.replace(f" {name}\n".encode(), f" scalar_{name}\n".encode())
+    path.write_bytes(content)
+    read = read_spectral_ply(path)
+    assert set(read.extra) == {*columns, "scalar_quality"}
+    np.testing.assert_array_equal(material_spectra(read), material_spectra(written))
 
 
 @pytest.mark.slow

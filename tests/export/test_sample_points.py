@@ -1,4 +1,5 @@
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import ball_run
@@ -14,8 +15,22 @@ from hsi_sc_nerf.cli.trained_runs import SampleCommand
 from hsi_sc_nerf.data.dataparser import split_frames
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.comparison import read_surface
-from hsi_sc_nerf.export.cloud import material_spectra, read_spectral_ply, write_spectral_ply
-from hsi_sc_nerf.export.sample_points import frontal_views, outward_normals, read_points
+from hsi_sc_nerf.export.cloud import (
+    INCIDENCE,
+    LIGHT_COLUMNS,
+    band_property_names,
+    material_spectra,
+    read_spectral_ply,
+    stream,
+    write_spectral_ply,
+)
+from hsi_sc_nerf.export.sample_points import (
+    PointSpectra,
+    frontal_views,
+    outward_normals,
+    read_points,
+    write_sampled_ply,
+)
 from hsi_sc_nerf.models.trained_run import open_trained_run
 
 
@@ -184,6 +199,25 @@ def test_a_cloud_keeps_its_colours_and_its_spectra_are_replaced(tmp_path, sample
     assert (cloud.colours[:, 0] == 200).all()
     np.testing.assert_array_equal(cloud.spectra, before.spectra)
     assert list(cloud.extra) == ["quality", "sampled_views", "sampled_std"]
+
+
+def test_columns_that_another_run_measured_do_not_stay_beside_new_spectra(tmp_path):
+    old_nm, new_nm = np.array([670.0, 800.0]), np.array([672.0, 802.0, 900.0])
+    material = band_property_names(old_nm, "material")
+    names = ("views", INCIDENCE, *LIGHT_COLUMNS, *material, "scalar_spectral_std", "quality")
+    cloud = random_cloud(20, old_nm, extra={name: np.full(20, 7.0, np.float32) for name in names})
+    write_spectral_ply(tmp_path / "old.ply", replace(stream(cloud), run="an/older/run"))
+    found = PointSpectra(cloud.normals, np.full((20, 3), 0.5, np.float32), *np.ones((2, 20), np.float32))
+    written = tmp_path / "new.ply"
+    write_sampled_ply(written, read_points(tmp_path / "old.ply"), found, new_nm, [1, 0, 0], "this/newer/run")
+    read = read_spectral_ply(written)
+    np.testing.assert_array_equal(read.wavelengths_nm, new_nm)
+    assert set(read.extra) == {"quality", "sampled_views", "sampled_std"}
+    np.testing.assert_array_equal(read.colours, cloud.colours)
+    comments = PlyData.read(str(written)).comments
+    assert [line for line in comments if line.startswith("run: ")] == ["run: this/newer/run"]
+    assert not any(line.startswith(("views [", "material_ [", "irradiance [")) for line in comments)
+    assert any(line.startswith("x y z [m]") for line in comments)
 
 
 TRIANGLE = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
