@@ -121,16 +121,42 @@ def outward_normals(
 
 
 def frontal_views(
-    cosines: Float[np.ndarray, "n cameras"], in_frame: Bool[np.ndarray, "n cameras"], count: int
-) -> tuple[Int[np.ndarray, "n views"], Bool[np.ndarray, "n views"]]:
-    """The ``count`` most frontal cameras of each point, or all if there are fewer, and which of them see it.
+    cosines: Float[np.ndarray, "n cameras"], in_frame: Bool[np.ndarray, "n cameras"]
+) -> tuple[Int[np.ndarray, "n cameras"], Bool[np.ndarray, "n cameras"]]:
+    """The cameras of each point, the most frontal first, and which of them the point faces, the first ones."""
+    ranked = np.where(in_frame, cosines, -1.0)
+    cameras = np.argsort(-ranked, axis=1)
+    return cameras, np.take_along_axis(ranked, cameras, axis=1) > np.cos(np.deg2rad(MAX_INCIDENCE_DEG))
+
+
+def first_hits(
+    facing: Bool[np.ndarray, "n cameras"],
+    count: int,
+    render: Callable[[Int[np.ndarray, "rays"], Int[np.ndarray, "rays"]], Float[np.ndarray, "rays bands"]],
+    bands: int,
+) -> Float[np.ndarray, "n count bands"]:
+    """Spectra of each point in the first ``count`` of its cameras that see it; NaN where there are fewer.
+
+    An occluder hides a point from cameras that it faces, which only a rendered ray tells. So as many cameras of a
+    point are rendered as it still needs, until it has enough or none is left.
 
     Args:
-        count: cameras a point, at most.
+        facing: cameras to try, in this order.
+        render: spectra of points in their cameras of a rank; NaN where the camera does not see the point.
     """
-    ranked = np.where(in_frame, cosines, -1.0)
-    cameras = np.argsort(-ranked, axis=1)[:, :count]
-    return cameras, np.take_along_axis(ranked, cameras, axis=1) > np.cos(np.deg2rad(MAX_INCIDENCE_DEG))
+    spectra = np.full((len(facing), count, bands), np.nan, np.float32)
+    found, tried = np.zeros((2, len(facing)), int)
+    ranks = np.arange(facing.shape[1])
+    while True:
+        until = tried + count - found
+        point, rank = np.nonzero(facing & (ranks >= tried[:, None]) & (ranks < until[:, None]))
+        if len(point) == 0:
+            return spectra
+        rendered = render(point, rank)
+        hit = np.isfinite(rendered[:, 0])
+        point, rendered, tried = point[hit], rendered[hit], until
+        spectra[point, found[point] + np.arange(len(point)) - np.searchsorted(point, point)] = rendered
+        found += np.bincount(point, minlength=len(facing))
 
 
 @torch.no_grad()
@@ -142,24 +168,27 @@ def _render_views(
     max_distance: float,
     max_views: int,
 ) -> Float[np.ndarray, "n views bands"]:
-    """Spectra of points in their most frontal cameras; NaN where the ray ends elsewhere. Scene units."""
+    """Spectra of points in the most frontal cameras that see them. Scene units."""
     model, intrinsics = run.model, run.dataset.intrinsics
     to_point = points[:, None] - poses[:, :3, 3]
     distances = np.linalg.norm(to_point, axis=-1)
     directions = to_point / distances[..., None]
     cosines = -np.einsum("nk,nck->nc", normals, directions)
     in_frame = np.stack([_in_frame(points, pose, intrinsics) for pose in poses], axis=1)
-    cameras, facing = frontal_views(cosines, in_frame, max_views)
-    spectra = np.full((*cameras.shape, len(model.wavelengths_nm)), np.nan, np.float32)
-    point, view = np.nonzero(facing)
-    chunk = model.config.eval_num_rays_per_chunk
-    for start in range(0, len(point), chunk):
-        p, v = point[start : start + chunk], view[start : start + chunk]
-        c = cameras[p, v]
-        rendered, opacity, depth = _render_rays(model, poses[c, :3, 3], directions[p, c], cosines[p, c])
-        hit = (opacity > MIN_OPACITY) & (np.abs(depth - distances[p, c]) * cosines[p, c] <= max_distance)
-        spectra[p[hit], v[hit]] = rendered[hit]
-    return spectra
+    cameras, facing = frontal_views(cosines, in_frame)
+    bands, chunk = len(model.wavelengths_nm), model.config.eval_num_rays_per_chunk
+
+    def render(point: Int[np.ndarray, "rays"], rank: Int[np.ndarray, "rays"]) -> Float[np.ndarray, "rays bands"]:
+        spectra = np.full((len(point), bands), np.nan, np.float32)
+        for start in range(0, len(point), chunk):
+            p = point[start : start + chunk]
+            c = cameras[p, rank[start : start + chunk]]
+            rendered, opacity, depth = _render_rays(model, poses[c, :3, 3], directions[p, c], cosines[p, c])
+            hit = (opacity > MIN_OPACITY) & (np.abs(depth - distances[p, c]) * cosines[p, c] <= max_distance)
+            spectra[start : start + chunk][hit] = rendered[hit]
+        return spectra
+
+    return first_hits(facing, min(max_views, len(poses)), render, bands)
 
 
 def _render_rays(

@@ -26,6 +26,7 @@ from hsi_sc_nerf.export.cloud import (
 )
 from hsi_sc_nerf.export.sample_points import (
     PointSpectra,
+    first_hits,
     frontal_views,
     outward_normals,
     read_points,
@@ -37,9 +38,27 @@ from hsi_sc_nerf.models.trained_run import open_trained_run
 def test_frontal_views_are_the_largest_cosines_in_the_frame():
     cosines = np.array([[0.9, 0.5, 0.99, 0.7], [0.3, 0.2, 0.1, -1.0], [0.6, 0.6, 0.6, 0.6]])
     in_frame = np.array([[True, True, False, True], [True, True, True, True], [False, False, False, False]])
-    for count, expected in ((2, [[0, 3], [], []]), (9, [[0, 3, 1], [], []])):
-        cameras, seen = frontal_views(cosines, in_frame, count)
-        assert [row[mask].tolist() for row, mask in zip(cameras, seen, strict=True)] == expected
+    cameras, faced = frontal_views(cosines, in_frame)
+    assert [row[mask].tolist() for row, mask in zip(cameras, faced, strict=True)] == [[0, 3, 1], [], []]
+
+
+@pytest.mark.parametrize("count", [1, 3, 7])
+def test_a_camera_that_an_occluder_hides_is_replaced_by_the_next(count):
+    rng, asked = np.random.default_rng(0), []
+    faced = np.arange(12) < rng.integers(0, 13, (40, 1))
+    sees = rng.random((40, 12)) < 0.5
+
+    def render(point, rank):
+        asked.extend(zip(point.tolist(), rank.tolist(), strict=True))
+        return np.where(sees[point, rank], rank, np.nan)[:, None]
+
+    spectra = first_hits(faced, count, render, bands=1)[..., 0]
+    for point, row in enumerate(spectra):
+        expected = np.flatnonzero(faced[point] & sees[point])[:count]
+        np.testing.assert_array_equal(row[np.isfinite(row)], expected)
+        ranks = [rank for other, rank in asked if other == point]
+        last = expected[-1] + 1 if len(expected) == count else faced[point].sum()
+        assert ranks == list(range(last))  # no camera twice, and none after enough see it
 
 
 def test_normals_turn_to_the_side_of_lower_density():
