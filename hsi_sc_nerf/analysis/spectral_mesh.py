@@ -76,7 +76,8 @@ def with_spectra(
     """Give each vertex the distance-weighted mean spectrum of the `NEIGHBOURS` nearest points.
 
     Points whose spectrum is not finite are ignored; `hsi-sc-nerf sample` writes NaN where no view sees a point. A
-    cloud by `hsi-sc-nerf material` gives the material's spectra, and those measured beside them.
+    cloud by `hsi-sc-nerf material` gives the material's spectra, and those measured beside them; points without a
+    known material are ignored as well.
 
     Args:
         mesh: in the frame of the cloud.
@@ -87,7 +88,11 @@ def with_spectra(
     Raises:
         InputError: that leaves no point.
     """
-    known = np.isfinite(cloud.spectra).all(axis=1)
+    known, material = np.isfinite(cloud.spectra).all(axis=1), material_spectra(cloud)
+    if not set(LIGHT_COLUMNS) <= set(cloud.extra):
+        material = None
+    if material is not None:
+        known &= np.isfinite(material).all(axis=1)
     if not known.any():
         raise InputError("no point of the cloud has a spectrum; export the cloud again.")
     used = np.flatnonzero(known & (cloud.extra.get(INCIDENCE, np.zeros(len(cloud))) <= max_incidence_deg))
@@ -105,8 +110,8 @@ def with_spectra(
             found[chunk] = np.einsum("vk,vkb->vb", weights[chunk], values[used[neighbours[chunk]]])
         return found
 
-    spectra, material, lit, scatter = mean(cloud.spectra), material_spectra(cloud), None, None
-    if material is not None and set(LIGHT_COLUMNS) <= set(cloud.extra):
+    spectra, lit, scatter = mean(cloud.spectra), None, None
+    if material is not None:
         light = mean(np.stack([cloud.extra[name] for name in LIGHT_COLUMNS], axis=1))
         spectra, lit = mean(material), LitSpectra(spectra, *light.T)
     if {"views", "spectral_std"} <= set(cloud.extra):

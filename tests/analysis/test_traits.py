@@ -233,6 +233,22 @@ def test_a_cloud_by_material_gives_both_reflectances(tmp_path):
     assert titles[5:9] == ["low material mean", "low material SD", "low measured mean", "low measured SD"]
 
 
+def test_points_whose_material_is_not_known_give_no_spectrum():
+    """As `sample --material` leaves them further than 3 mm from the material's cloud."""
+    surface = two_halves()
+    cloud = shaded_cloud(surface)
+    far = cloud.points[:, 1] < 0.0
+    for name in (*band_property_names(NM, "material"), "irradiance", "irradiance_std"):
+        cloud.extra[name][far] = np.nan
+    found = with_spectra(surface.mesh, cloud, seen_within_m=0.001)
+    assert np.isfinite(found.spectra).all()
+    assert not found.seen[cloud.points[:, 1] < -0.002].any()
+    assert found.seen[~far].all()
+    assert classified(found, LIBRARY, 0.1).names == LIBRARY.names
+    with pytest.raises(InputError, match="no point of the cloud has a spectrum"):
+        with_spectra(surface.mesh, replace(cloud, spectra=np.where(far[:, None], cloud.spectra, np.nan)), 0.001)
+
+
 @pytest.mark.parametrize(("spectrum", "incidence_deg"), [(9.0, 71.0), (np.nan, 0.0)])
 def test_points_seen_too_obliquely_or_without_a_spectrum_give_none(spectrum, incidence_deg):
     surface = two_halves()
