@@ -47,6 +47,7 @@ class DayComparison:
         grown: regions of each quantity that had changed since the first day, on the day before and on this one.
         classes: regions of each class, on the first day and on this one; empty without a library.
         class_map: their maps; None without a library.
+        left_out: indices that are defined on too little of the surface to be compared.
     """
 
     before: str
@@ -56,6 +57,7 @@ class DayComparison:
     grown: Mapping[str, list[GrownRegion]]
     classes: Mapping[str, list[GrownRegion]]
     class_map: ClassChange | None = None
+    left_out: tuple[str, ...] = ()
 
 
 def compare_days(
@@ -94,17 +96,19 @@ def compare_days(
         quantities = changes(first, after, bands_nm, indices, session_sd, repeat)
         grown = {}
         for name, quantity in quantities.items():
-            then = np.zeros_like(quantity.changed) if earlier is None else earlier[name].changed
+            was = None if earlier is None else earlier.get(name)
+            then = np.zeros_like(quantity.changed) if was is None else was.changed
             grown[name] = grown_regions(mesh, areas_m2, then, quantity.changed)
         classes, class_map = {}, None
         if library is not None and at_first is not None:
-            was, now = at_first.mixture_labels, classified(after.surface, library, angle_rad).mixture_labels
-            class_map = ClassChange(at_first.names, was, np.where(_beyond_noise(quantities, mesh), now, was))
+            labels, now = at_first.mixture_labels, classified(after.surface, library, angle_rad).mixture_labels
+            class_map = ClassChange(at_first.names, labels, np.where(_beyond_noise(quantities, mesh), now, labels))
             classes = {
                 name: grown_regions(mesh, areas_m2, class_map.before == number, class_map.after == number)
                 for number, name in enumerate(class_map.names)
             }
-        yield DayComparison(first.name, after, quantities, before.name, grown, classes, class_map)
+        left_out = tuple(index.name for index in indices if index.name not in quantities)
+        yield DayComparison(first.name, after, quantities, before.name, grown, classes, class_map, left_out)
         earlier = quantities
 
 

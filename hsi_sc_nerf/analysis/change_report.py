@@ -102,6 +102,12 @@ def write_change_tables(
         writer.writerows([_cell(row[column]) for column in COLUMNS] for row in rows)
     parts = ["# Change over time", *_set_down(comparisons, repeat)]
     parts += ["## What changed", *_table([row for row in rows if row["kind"] == CHANGED])]
+    parts += [
+        f"Left out of {markdown_text(one.after.name)}: {', '.join(map(markdown_text, one.left_out))}, which has a "
+        "value on hardly any of the surface of both days."
+        for one in comparisons
+        if one.left_out
+    ]
     parts += _undecided(comparisons, [row for row in rows if row["kind"] == UNDECIDED])
     for kind, heading in (("grown", "Areas since the day before"), ("class", "Areas of classes")):
         if some := [row for row in rows if row["kind"] == kind]:

@@ -21,6 +21,7 @@ from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.export.cloud import read_spectral_ply
 from hsi_sc_nerf.geometry.camera import Similarity
 from hsi_sc_nerf.geometry.mesh import Mesh
+from hsi_sc_nerf.indices.formula import SpectralIndex
 from hsi_sc_nerf.plotting import COLOURS
 from hsi_sc_nerf.simulate.materials import smooth_noise
 
@@ -128,6 +129,19 @@ def test_page_table_and_cloud_tell_what_is_undecided(first, alone, tmp_path):
     write_change_tables(tmp_path, compared(first, day(1, spot(SMALL_M)), repeat=repeat), {}, {}, repeat)
     assert "limit of blank" not in (tmp_path / "change.md").read_text()
     assert json.loads((tmp_path / "change.json").read_text())["days"][0]["limit_of_blank_m2"] is None
+
+
+def test_an_index_without_values_on_one_day_is_left_out_of_it_and_the_page_says_so(first, tmp_path):
+    dark = day(1)
+    dark.surface.spectra[:, 1] = -0.001
+    later = day(2, spot(LARGE_M))
+    comparisons = list(compare_days([first, dark, later], (), [SpectralIndex("SR", "R800 / R600")], 0.01))
+    assert [one.left_out for one in comparisons] == [("SR",), ()]
+    assert "SR" not in comparisons[0].quantities
+    (grown,) = comparisons[1].grown["SR"]
+    assert grown.before_m2 == 0.0
+    write_change_tables(tmp_path, comparisons, {}, {})
+    assert [line for line in (tmp_path / "change.md").read_text().splitlines() if "day 1: SR" in line]
 
 
 def test_undecided_regions_are_striped_in_the_picture(first, alone, tmp_path, monkeypatch):
