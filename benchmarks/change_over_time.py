@@ -117,7 +117,7 @@ class ChangeOverTime:
             ("apple_skin",), mesh, np.ones((len(mesh.vertices), 1)), endmembers(("apple_skin",), NM), NM
         )
         clouds = [cloud_of(skin, SetDown(), CloudErrors(), self.points, seed) for seed in (0, 1)]
-        samples = surface_samples(clouds, [cloud.spectra for cloud in clouds])
+        samples = surface_samples(clouds, [cloud.spectra for cloud in clouds], ("first", "second"))
         try:
             told = f"{find_attitude(samples[1], samples[0]).turn_deg:.2f}"
         except InputError as error:

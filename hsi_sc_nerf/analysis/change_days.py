@@ -82,7 +82,7 @@ def days_on_one_mesh(
     known = [np.isfinite(one).all(axis=1) for one in spectra if one is not None]
     clouds = [cloud.select(rows) for cloud, rows in zip(clouds, known, strict=True)]
     samples = surface_samples(
-        clouds, [one[rows] for one, rows in zip(spectra, known, strict=True) if one is not None]
+        clouds, [one[rows] for one, rows in zip(spectra, known, strict=True) if one is not None], names
     )
 
     mesh = closed_mesh(clouds[0].points, clouds[0].normals, config)

@@ -18,6 +18,7 @@ SPACINGS_M = (0.005, 0.002)
 COMPONENTS = 3
 """Principal components of the spectra's shape that count, beside brightness."""
 LEAST_POINTS = 100
+"""Of the coarse sample: 25 cm2 of surface."""
 _NEIGHBOURS = 13
 _DRAWN = 20_000
 """Spectra that the components are found from."""
@@ -39,7 +40,7 @@ class SurfaceSample:
 
 
 def surface_samples(
-    clouds: Sequence[SpectralCloud], spectra: Sequence[Float[np.ndarray, "n bands"]]
+    clouds: Sequence[SpectralCloud], spectra: Sequence[Float[np.ndarray, "n bands"]], names: Sequence[str]
 ) -> list[list[SurfaceSample]]:
     """A coarse and a fine sample of each cloud, with features that are the same for all.
 
@@ -48,22 +49,24 @@ def surface_samples(
     Args:
         clouds: clouds of one object, same bands.
         spectra: spectra of the points of each, as measured or of the material.
+        names: names of the clouds.
 
     Raises:
-        InputError: a cloud has too few points.
+        InputError: an object is too small, or a cloud has too few points.
     """
     units = [unit_spectra(some) for some in spectra]
     every = np.concatenate([one[:: max(1, len(one) // _DRAWN)] for one in units])
     axes = np.linalg.svd(every - every.mean(axis=0), full_matrices=False)[2][: min(COMPONENTS, every.shape[1] - 1)]
     samples = []
-    for cloud, some, unit in zip(clouds, spectra, units, strict=True):
+    for cloud, some, unit, name in zip(clouds, spectra, units, names, strict=True):
         features = np.column_stack([np.log(np.maximum(some.mean(axis=1), 1e-3)), unit @ axes.T])
         features -= np.median(features, axis=0)
         samples.append([_thinned(cloud, features, spacing_m) for spacing_m in SPACINGS_M])
         if len(samples[-1][0].points) < LEAST_POINTS:
             raise InputError(
-                f"a cloud has only {len(samples[-1][0].points)} points {SPACINGS_M[0] * 1e3:g} mm apart; give clouds "
-                "of the whole object, in metres."
+                f"{name}: the object is too small for patches of {SPACINGS_M[0] * 1e3:g} mm: change needs "
+                "about 25 cm2 of surface, so a fruit of at least 26 mm; if it is larger, give a cloud of all of it, "
+                "in metres."
             )
     return samples
 

@@ -56,8 +56,8 @@ class ChangeCommand:
     """An index to compare, by its name or as a formula, as for `hsi-sc-nerf traits`. May be repeated. Default: NDVI,
     NDVI705 and WI, where the bands allow."""
     session_std: float = between(0.0, 1.0, default=0.01)
-    """Relative standard deviation of what the white references of two sessions make of one reflectance. It counts in
-    what is said of the whole surface, not in what changed here and not there."""
+    """How much the white references of two sessions may differ, as a fraction (0.01 is 1 %). Without --repeat it
+    concerns only the row 'whole surface'; with --repeat an area must also have changed by more than this."""
     piece: tuple[int, ...] = between(1, math.inf, default=())
     """Where several objects stand on the table, which of them: one number for all clouds, or one for each, a repeat
     last. 1 is the largest, as for `hsi-sc-nerf traits`, which tells where each stands."""
@@ -136,7 +136,9 @@ class ChangeCommand:
             change_pictures.write_film(film, days[0], comparisons, views, shown)
             change_report.write_change_ply(self.output_dir / "change.ply", days[0], comparisons)
             settings = {"band_nm": list(self.band_nm), "session_std": self.session_std, **asdict(self.mesh)}
-            settings |= {"max_incidence_deg": self.max_incidence_deg}
+            settings |= {"max_incidence_deg": self.max_incidence_deg, "angle_rad": self.angle_rad}
+            settings |= {"library": None if self.library is None else str(self.library)}
+            settings |= {"index": [index.definition for index in indices], "piece": list(self.piece)}
             change_report.write_change_tables(self.output_dir, comparisons, settings, pictures, repeat)
         page = escape(str(self.output_dir / "change.md"))
         console.print(f"Changes, with pictures: {page}", soft_wrap=True)

@@ -1,5 +1,7 @@
 """Attitudes of simulated fruit that was set down again are found; those of a plain ball are refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from another_day import CloudErrors, SetDown, cloud_of, fruit_of, set_down
@@ -17,7 +19,7 @@ POINTS = 20_000
 
 
 def registered(before, after):
-    samples = surface_samples([before, after], [before.spectra, after.spectra])
+    samples = surface_samples([before, after], [before.spectra, after.spectra], ("before", "after"))
     return find_attitude(samples[1], samples[0])
 
 
@@ -67,10 +69,15 @@ def test_another_object_is_refused(first_day):
         registered(first_day, larger)
 
 
-def test_a_cloud_of_few_points_is_refused(first_day):
-    few = first_day.select(slice(0, 50))
-    with pytest.raises(InputError, match="points 5 mm apart"):
-        surface_samples([few, few], [few.spectra, few.spectra])
+def test_an_object_that_is_too_small_is_refused_by_name(first_day):
+    """A ball of 26 mm, but for where it stands, has the patches that are needed; one of 20 mm does not."""
+    normals = np.random.default_rng(0).normal(size=(30_000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    seen = normals[normals[:, 2] > -0.7]
+    rows = np.arange(len(seen)) % len(first_day)
+    small, enough = (replace(first_day.select(rows), points=radius_m * seen) for radius_m in (0.010, 0.0135))
+    with pytest.raises(InputError, match=r"friday: .* too small .* 26 mm"):
+        surface_samples([enough, small], [enough.spectra, small.spectra], ("monday", "friday"))
 
 
 def test_gradients_of_a_linear_function_on_a_tilted_plane_are_its_slopes_along_the_plane():

@@ -91,6 +91,10 @@ def test_files_hold_the_attitudes_the_maps_and_the_film(written):
     assert again["turn_deg"] == pytest.approx(120.0, abs=0.5)
     assert friday["turn_deg"] == pytest.approx(40.0, abs=0.5)
     assert content["repeat"]["name"] == "repeat repeat"
+    settings = content["settings"]
+    assert settings["library"].endswith("library.csv")
+    assert [index.split(" = ")[0] for index in settings["index"]] == ["NDVI", "NDVI705", "WI"]
+    assert (settings["angle_rad"], settings["piece"]) == (0.1, [])
     assert content["repeat"]["attitude"]["turn_deg"] == pytest.approx(-110.0, abs=0.5)
     mesh = read_spectral_ply(written / "change.ply")
     assert {"ndvi_change_1", "spectrum_p_2", "surface_region_2", "r670_change_2"} <= set(mesh.extra)
