@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from hsi_sc_nerf.export.cloud import SpectralCloud
     from hsi_sc_nerf.light.known_light import KnownLight
     from hsi_sc_nerf.light.of_run import RunLight
+    from hsi_sc_nerf.models.trained_run import TrainedRun
 
 UNCERTAIN = 0.05
 """Irradiance that is more uncertain than this, relative to it, is warned of."""
@@ -60,15 +61,18 @@ class MaterialCommand:
     white_elevation_deg: float = between(-90.0, 90.0, default=0.0)
     """The same above the optical axis of the camera."""
 
-    def main(self) -> None:
+    def main(self, run: TrainedRun | None = None) -> None:
         """Run the command.
+
+        Args:
+            run: that of ``load_config``, where it is open already.
 
         Raises:
             InputError: cloud and run do not fit together or cannot be used, or the result cannot be written.
         """
         known = self.checked_light()
         require_dataset_of_run(self.load_config)
-        from hsi_sc_nerf.export.cloud import band_property_names, read_spectral_ply, stream
+        from hsi_sc_nerf.export.cloud import band_property_names, read_spectral_ply, run_name, stream
         from hsi_sc_nerf.export.cloud_material import require_bands_of_run, with_material
         from hsi_sc_nerf.export.formats import format_of, require_format, write_cloud
         from hsi_sc_nerf.files import require_writable, write_json
@@ -81,13 +85,14 @@ class MaterialCommand:
         cloud = read_spectral_ply(self.cloud)
         extra = {*cloud.extra, *LIGHT_COLUMNS, *band_property_names(cloud.wavelengths_nm, "material")}
         require_format(stem, file_format, len(cloud.wavelengths_nm), len(extra))
-        run = open_trained_run(self.load_config)
+        if run is None:
+            run = open_trained_run(self.load_config)
         require_bands_of_run(cloud, run.model.wavelengths_nm, str(self.cloud))
         found = light_of_run(run, self._white_normal(), known)
         corrected = self.correct == "always" or (self.correct == "auto" and found.evidence.shaded)
         result = with_material(cloud, found, run.model.wavelengths_nm, corrected=corrected)
         told = light_summary(found, result, corrected=corrected, light_from=self.light)
-        write_cloud(stem, stream(result), file_format)
+        write_cloud(stem, replace(stream(result), run=run_name(self.load_config)), file_format)
         write_json(output.with_suffix(".json"), told)
         console = Console(soft_wrap=True, highlight=False)
         for line in sentences(told):

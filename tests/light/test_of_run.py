@@ -1,6 +1,7 @@
 """The light on a run's object, the command, and what tells of shading: balls of known irradiance."""
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import ball_run
@@ -8,12 +9,13 @@ import capture_factory as factory
 import numpy as np
 import pytest
 from light_on_a_ball import FACING, measured, turning_ball
+from plyfile import PlyData
 from random_cloud import random_cloud
 
-from hsi_sc_nerf.cli.light import light_summary, sentences
+from hsi_sc_nerf.cli.light import MaterialCommand, light_summary, sentences
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.spatial import sample_surface
-from hsi_sc_nerf.export.cloud import SpectralCloud, read_spectral_ply, stream
+from hsi_sc_nerf.export.cloud import SpectralCloud, read_spectral_ply, stream, write_spectral_ply
 from hsi_sc_nerf.export.cloud_material import require_bands_of_run, with_material
 from hsi_sc_nerf.export.formats import write_cloud
 from hsi_sc_nerf.files import write_json
@@ -191,6 +193,13 @@ def test_even_light_is_left_alone(even):
     np.testing.assert_array_equal(same.extra["irradiance"], 1.0)
     # That of the white reference.
     np.testing.assert_allclose(same.extra["irradiance_std"], 0.01)
+
+
+@pytest.mark.slow
+def test_the_command_states_the_run_in_its_cloud(even, tmp_path):
+    write_spectral_ply(tmp_path / "cloud.ply", upper_cloud(even, lit=False))
+    MaterialCommand(tmp_path / "cloud.ply", Path("runs/ball/now/config.yml")).main(even.run)
+    assert "run: runs/ball/now" in PlyData.read(str(tmp_path / "cloud-material.ply")).comments
 
 
 def test_a_cloud_of_other_bands_is_refused():
