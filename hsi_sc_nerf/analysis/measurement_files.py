@@ -94,6 +94,19 @@ def write_measurement(folder: Path | str, measured: Measurement, name: str) -> d
     return content
 
 
+def is_replaced(path: Path, folder: Path, also: Collection[str] = ()) -> bool:
+    """Whether a result in a folder, or in those of its pieces, replaces or deletes a file.
+
+    Args:
+        path: the file.
+        folder: for the result.
+        also: names of further files that are written there.
+    """
+    places = (folder, *folder.glob("piece-*"))
+    written = (place / name for place in places for name in (*_TABLES, *also))
+    return path.is_file() and any(one.is_file() and one.samefile(path) for one in written)
+
+
 def delete_earlier(folder: Path, keep: Collection[str] = ()) -> None:
     """Delete the files of `write_measurement` in a folder, and the folder, if nothing else is in it.
 

@@ -22,6 +22,8 @@ from hsi_sc_nerf.files import require_writable
 from hsi_sc_nerf.settings_file import between, check_options
 from hsi_sc_nerf.terminal import screen_table
 
+PROPOSED = "regions_proposed.json"
+
 
 @dataclass(frozen=True)
 class CompareCommand:
@@ -147,6 +149,20 @@ class TraitsCommand:
         for path in self.calibration:
             read_calibration(path)
 
+    def _require_inputs_kept(self) -> None:
+        """Refuse to write over what the command is given.
+
+        Raises:
+            InputError: a result would replace or delete a given file.
+        """
+        from hsi_sc_nerf.analysis.measurement_files import is_replaced
+
+        also = [PROPOSED] if self.propose_regions else []
+        also += ["endmembers.csv"] if self.components else []
+        for path in (self.cloud, self.library, self.roi_file, *self.calibration):
+            if path is not None and is_replaced(path, self.output_dir, also):
+                raise InputError(f"{path}: would be replaced by the results; choose another --output-dir.")
+
     def main(self) -> None:
         """Measure and write.
 
@@ -162,6 +178,7 @@ class TraitsCommand:
         from hsi_sc_nerf.packed.dataset import open_packed
 
         self.check()
+        self._require_inputs_kept()
         require_writable(self.output_dir)
         library = read_library(self.library) if self.library else None
         if library is not None and self.classes:
@@ -197,7 +214,7 @@ class TraitsCommand:
         if self.propose_regions:
             with console.status("organs"):
                 proposed = propose_regions(cloud)
-                write_drawn_regions(path := self.output_dir / "regions_proposed.json", proposed)
+                write_drawn_regions(path := self.output_dir / PROPOSED, proposed)
             found = ", ".join(one.name for one in proposed)
             if len(proposed) == 1:
                 found += " alone, for no end or side of the object differs from the rest in shape or spectrum"

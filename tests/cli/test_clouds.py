@@ -7,11 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from known_fruit import CAP_CM2, SKIN, fruit_cloud
+from known_fruit import CAP_CM2, NM, SKIN, fruit_cloud
 
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
+from hsi_sc_nerf.analysis.drawn_regions import DrawnRegion, write_drawn_regions
+from hsi_sc_nerf.analysis.library import SpectralLibrary, write_library
 from hsi_sc_nerf.api.clouds import read_cloud
 from hsi_sc_nerf.cli.clouds import TraitsCommand
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import INCIDENCE, write_spectral_ply
 
 QUICK = {"splits": 0, "mesh": MeshConfig(octree_depth=6)}
@@ -42,6 +45,40 @@ def test_where_nothing_differs_one_sentence_says_so(tmp_path, capfd):
     assert f"no {INCIDENCE}" in told
     (body,) = json.loads((tmp_path / "regions_proposed.json").read_text())["regions"]
     assert len(body["points"]) == 8000
+
+
+@pytest.mark.parametrize(
+    ("given", "options"),
+    [
+        ("mesh.ply", {}),
+        ("spectra.csv", {}),
+        ("piece-2/regions.sli", {}),
+        ("endmembers.csv", {"components": 2}),
+        ("regions_proposed.json", {"propose_regions": True}),
+    ],
+)
+def test_results_do_not_replace_what_the_command_is_given(tmp_path, given, options):
+    path = tmp_path / given
+    path.parent.mkdir(exist_ok=True)
+    cloud = fruit_cloud(count=50)
+    write_spectral_ply(tmp_path / "fruit.ply", cloud)
+    inputs = {"cloud": tmp_path / "fruit.ply"}
+    if path.suffix == ".ply":
+        write_spectral_ply(path, cloud)
+        inputs["cloud"] = path
+    elif path.suffix == ".json":
+        write_drawn_regions(path, [DrawnRegion("top", cloud.points, np.arange(50) < 9)])
+        inputs["roi_file"] = path
+    else:
+        write_library(path, SpectralLibrary(("skin",), NM, SKIN[None]))
+        inputs["library"] = path
+    before = path.read_bytes()
+    with pytest.raises(InputError, match=f"{path.name}: would be replaced"):
+        TraitsCommand(**inputs, output_dir=tmp_path, **options, **QUICK).main()
+    assert path.read_bytes() == before
+    if options:  # without which these files stay
+        with pytest.raises(InputError, match="other\\.ply"):
+            TraitsCommand(**inputs | {"cloud": tmp_path / "other.ply"}, output_dir=tmp_path, **QUICK).main()
 
 
 @pytest.mark.slow
