@@ -317,7 +317,7 @@ def trait_errors(cloud: SpectralCloud, true: TrueObject, eyes_m: Float[np.ndarra
     bruised_m2 = float(ideal.areas_m2[ideal.seen & (true.weights[:, is_bruise].sum(axis=1) > 0.5)].sum())
     if bruised_m2 > 0.0:
         library = SpectralLibrary(true.materials, true.wavelengths_nm, true.endmembers)
-        classes = classified(surface, library, paper.CLASSIFICATION_ANGLE_RAD, 0.0)
+        classes = classified(surface, library, paper.CLASSIFICATION_ANGLE_RAD)
         found_m2 = classes.mixture_areas_m2[classes.names.index("bruise")]
         errors["bruise_percent"] = 100.0 * (found_m2 / bruised_m2 - 1.0)
     return errors

@@ -155,11 +155,11 @@ def _class_rows(surface: SpectralMesh, true: TrueObject, ideal: SpectralMesh) ->
     library = SpectralLibrary(
         tuple(name for name, _ in references), true.wavelengths_nm, np.stack([spectrum for _, spectrum in references])
     )
-    found, alike = (classified(one, library, paper.CLASSIFICATION_ANGLE_RAD, 0.0) for one in (surface, ideal))
+    found, alike = (classified(one, library, paper.CLASSIFICATION_ANGLE_RAD) for one in (surface, ideal))
     rows = []
     # Unmixing needs all tissues, each pure, and finds their mixtures itself.
     pure = SpectralLibrary(tuple(names), true.wavelengths_nm, true.endmembers)
-    unmixed = classified(surface, pure, paper.CLASSIFICATION_ANGLE_RAD, 0.0)
+    unmixed = classified(surface, pure, paper.CLASSIFICATION_ANGLE_RAD)
     mixture_m2 = dict(zip(unmixed.names, unmixed.mixture_areas_m2, strict=True))
     for name, area_m2, alike_m2 in zip(found.names, found.areas_m2, alike.areas_m2, strict=True):
         fraction = true.weights[:, [other == name for other in names]].sum(axis=1)

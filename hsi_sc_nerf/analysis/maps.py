@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Callable, Sequence
@@ -12,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.indices.formula import SpectralIndex, index_values
 
 _STEP = 1e-4
@@ -56,6 +58,35 @@ class SurfaceMap:
         """Its column in a cloud: ``index_`` or ``calibration_``, and the name with ``_`` for all but letters."""
         kind = "index" if self.definition else "calibration"
         return f"{kind}_{re.sub(r'[^A-Za-z0-9]+', '_', self.name)}"
+
+
+def require_own_names(names: Sequence[str]) -> None:
+    """Check the names of maps: tables have them without their signs.
+
+    Raises:
+        InputError: two are alike.
+    """
+    for one, other in itertools.combinations(names, 2):
+        if re.sub(r"[\W_]+", "_", one) == re.sub(r"[\W_]+", "_", other):
+            alike = "" if one == other else f" and {other}, which are alike but for signs"
+            raise InputError(f"two indices or calibrations are named {one}{alike}; give each a name of its own.")
+
+
+def numbered(columns: Sequence[str]) -> list[str]:
+    """The columns, of which equal ones get numbers: names in scripts other than the Latin one are ``_`` alone.
+
+    Example:
+        >>> numbered(["calibration__", "calibration_sugar", "calibration__"])
+        ['calibration__', 'calibration_sugar', 'calibration__2']
+    """
+    found: list[str] = []
+    for column in columns:
+        number, name = 1, column
+        while name in found:
+            number += 1
+            name = f"{column}{'' if column.endswith('_') else '_'}{number}"
+        found.append(name)
+    return found
 
 
 def index_maps(surface: SpectralMesh, indices: Sequence[SpectralIndex]) -> list[SurfaceMap]:

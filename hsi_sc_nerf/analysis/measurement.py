@@ -18,7 +18,7 @@ from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh, open_edges
 from hsi_sc_nerf.analysis.components import Components, find_components
 from hsi_sc_nerf.analysis.drawn_regions import DrawnRegion
 from hsi_sc_nerf.analysis.library import SpectralLibrary
-from hsi_sc_nerf.analysis.maps import index_maps
+from hsi_sc_nerf.analysis.maps import index_maps, require_own_names
 from hsi_sc_nerf.analysis.report import component_content, trait_content
 from hsi_sc_nerf.analysis.size import (
     Size,
@@ -124,6 +124,7 @@ def measure_traits(
     picked = [RegionOfInterest(name, (x, y, z), radius) for name, (x, y, z, radius) in (regions or {}).items()]
     found_indices = find_indices(indices, cloud.wavelengths_nm)
     read = [one if isinstance(one, Calibration) else read_calibration(one) for one in calibrations]
+    require_own_names([*(one.name for one in found_indices), *(one.name for one in read)])
     for calibration in read:
         calibration.interpolation(cloud.wavelengths_nm)  # which refuses before the work
     if library is not None:

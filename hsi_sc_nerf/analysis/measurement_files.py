@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.analysis import pictures, report
-from hsi_sc_nerf.analysis.class_maps import rest_words
+from hsi_sc_nerf.analysis.class_maps import ClassMap, rest_words
 from hsi_sc_nerf.analysis.library import write_library
+from hsi_sc_nerf.analysis.maps import SurfaceMap, numbered
 from hsi_sc_nerf.analysis.measurement import Measurement
 from hsi_sc_nerf.analysis.spectral_mesh import write_spectral_mesh
 from hsi_sc_nerf.analysis.traits import Traits
@@ -58,10 +59,12 @@ def write_measurement(folder: Path | str, measured: Measurement, name: str) -> d
         ):
             pictures.draw_classes(folder / picture, found.names, labels, surface, views)
             drawn[caption], extra[column] = picture, labels.astype("float32")
+    every: list[SurfaceMap | ClassMap] = [*traits.maps, *traits.class_maps]
+    columns = dict(zip((one.name for one in every), numbered([one.column for one in every]), strict=True))
     for one in traits.class_maps:
-        picture = f"{one.column}.png"
+        picture = f"{columns[one.name]}.png"
         pictures.draw_classes(folder / picture, one.classes, one.labels, surface, views, rest_words(one.limited))
-        drawn[f"Classes by {one.name}"], extra[one.column] = picture, one.labels.astype("float32")
+        drawn[f"Classes by {one.name}"], extra[columns[one.name]] = picture, one.labels.astype("float32")
     drawn["Spectra of regions"] = "region_spectra.png"
     pictures.draw_region_spectra(folder / "region_spectra.png", surface.wavelengths_nm, traits)
     if available_composites(surface.wavelengths_nm):
@@ -71,7 +74,7 @@ def write_measurement(folder: Path | str, measured: Measurement, name: str) -> d
         ("Indices", "indices.png"): {one.caption: one.values for one in traits.maps if one.definition},
         ("Calibrations", "calibrations.png"): {one.caption: one.values for one in traits.maps if not one.definition},
     }
-    extra |= {one.column: one.values.astype("float32") for one in traits.maps}
+    extra |= {columns[one.name]: one.values.astype("float32") for one in traits.maps}
     if components is not None:
         scores, fractions = components.columns()
         maps |= {

@@ -22,7 +22,7 @@ from hsi_sc_nerf.analysis.classes import (
 )
 from hsi_sc_nerf.analysis.drawn_regions import DrawnRegion
 from hsi_sc_nerf.analysis.library import SpectralLibrary
-from hsi_sc_nerf.analysis.maps import SurfaceMap, propagated_std
+from hsi_sc_nerf.analysis.maps import SurfaceMap, propagated_std, require_own_names
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.errors import InputError
 
@@ -194,10 +194,7 @@ def analyse(
     chosen: dict[str, Bool[np.ndarray, "v"]] = {WHOLE: surface.seen}
     if not surface.seen.any():
         raise InputError("no part of the mesh has points of the cloud near it; raise the smoothing radius.")
-    every: list[SurfaceMap | ClassMap] = [*maps, *class_maps]
-    for number, one in enumerate(every):
-        if any(one.name == other.name or one.column == other.column for other in every[:number]):
-            raise InputError(f"two indices or calibrations are named {one.name}; give each a name of its own.")
+    require_own_names([*(one.name for one in maps), *(one.name for one in class_maps)])
     if classes is not None:
         chosen |= {name: where for i, name in enumerate(classes.names) if (where := classes.labels == i).any()}
     for region in regions:
@@ -311,7 +308,6 @@ def classified(
     surface: SpectralMesh,
     library: SpectralLibrary,
     threshold_rad: float,
-    smallest_region_m2: float = SMALLEST_REGION_M2,
 ) -> Classes:
     """Classify the seen vertices against a library, brought to the surface's bands.
 
@@ -346,5 +342,5 @@ def classified(
         mixture_labels=mixture_labels,
         mixture_areas_m2=mixture_areas_m2[:-1],
         mixture_unclassified_m2=float(mixture_areas_m2[-1]),
-        regions=connected_regions(surface.mesh, labels, surface.areas_m2, smallest_region_m2),
+        regions=connected_regions(surface.mesh, labels, surface.areas_m2, SMALLEST_REGION_M2),
     )

@@ -1,5 +1,6 @@
 """Areas of the classes of a classifier whose probabilities are known in closed form."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,12 +9,16 @@ import pytest
 
 from hsi_sc_nerf.analysis.calibrations import Calibration, Domain, read_calibration
 from hsi_sc_nerf.analysis.class_maps import OUTSIDE, WITHOUT_LIMITS, class_areas, class_map
+from hsi_sc_nerf.analysis.maps import SurfaceMap
+from hsi_sc_nerf.analysis.measurement import Measurement
+from hsi_sc_nerf.analysis.measurement_files import write_measurement
 from hsi_sc_nerf.analysis.pictures import SideViews
 from hsi_sc_nerf.analysis.report import trait_content, trait_tables
 from hsi_sc_nerf.analysis.size import Size, size_of
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.analysis.traits import RegionOfInterest, analyse
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.export.cloud import read_spectral_ply
 from hsi_sc_nerf.simulate.mesh import cylinder
 
 NM = np.linspace(500.0, 900.0, 6)
@@ -188,6 +193,26 @@ def test_two_maps_of_one_name_are_refused():
     found = class_map(surface, classifier(0.01))
     with pytest.raises(InputError, match="named bruises"):
         analyse(surface, class_maps=[found, found])
+    signs = [replace(found, name=name) for name in ("Brix (%)", "Brix [%]")]
+    with pytest.raises(InputError, match="alike but for signs"):
+        analyse(surface, class_maps=signs)
+
+
+@pytest.mark.slow
+def test_calibrations_with_names_in_other_scripts_have_columns_of_their_own(tmp_path):
+    surface = surface_of(np.tile(SOUND, (len(MESH.vertices), 1)))
+    sugar, acid = (
+        SurfaceMap(name, "", np.full(len(MESH.vertices), value), lambda spectra: spectra[:, 0])
+        for name, value in (("糖度", 12.0), ("酸度", 0.4))
+    )
+    ripe = replace(class_map(surface, classifier(0.01)), name="成熟")
+    traits = analyse(surface, maps=[sugar, acid], class_maps=[ripe])
+    write_measurement(tmp_path, Measurement(surface, size_of(MESH), {}, traits, None, {}), "fruit")
+    columns = read_spectral_ply(tmp_path / "mesh.ply").extra
+    for column, value in (("calibration__", 12.0), ("calibration__2", 0.4), ("calibration__3", 0.0)):
+        assert columns[column] == pytest.approx(value)
+    assert (tmp_path / "calibration__3.png").is_file()
+    assert list(json.loads((tmp_path / "traits.json").read_text())["calibrations"]) == ["糖度", "酸度"]
 
 
 @pytest.mark.parametrize(

@@ -64,7 +64,7 @@ def test_blur_moves_the_edge_of_a_class_by_angle_but_not_by_mixture():
         brown = np.clip(0.5 + (0.008 - distance_m) / edge_m, 0.0, 1.0)[:, None]
         spectra = (light * (brown * BROWN + (1.0 - brown) * GREEN)).astype(np.float32)
         surface = SpectralMesh(mesh, spectra, NM, np.ones(len(spectra), bool))
-        found = classified(surface, library, 0.1, smallest_region_m2=1e-6)
+        found = classified(surface, library, 0.1)
         by_angle.append(found.areas_m2[1])
         by_mixture.append(found.mixture_areas_m2[1])
         assert found.mixture_areas_m2.sum() == pytest.approx(mesh.area_m2(), rel=0.01)
@@ -83,14 +83,14 @@ def even_surface(fractions):
 def test_references_of_one_name_are_one_class_of_a_mixture():
     """Two fifths of each of two skins and a fifth of a bruise are skin, not nothing."""
     surface = even_surface([0.4, 0.2, 0.4])
-    found = classified(surface, SpectralLibrary(("skin", "bruise", "skin"), NM, ENDMEMBERS), 0.1, 1e-6)
+    found = classified(surface, SpectralLibrary(("skin", "bruise", "skin"), NM, ENDMEMBERS), 0.1)
     assert found.names == ("skin", "bruise")
     assert found.mixture_areas_m2 == pytest.approx([surface.mesh.area_m2(), 0.0])
 
 
 def test_a_spot_of_which_no_class_has_half_is_of_none():
     surface = even_surface([0.45, 0.3, 0.25])
-    found = classified(surface, SpectralLibrary(("green", "brown", "red"), NM, ENDMEMBERS), np.pi, 1e-6)
+    found = classified(surface, SpectralLibrary(("green", "brown", "red"), NM, ENDMEMBERS), np.pi)
     assert (found.mixture_labels == -1).all()
     assert (found.labels >= 0).all()
 
@@ -99,6 +99,6 @@ def test_what_is_no_mixture_of_the_library_is_of_no_class():
     mesh = cylinder(0.04, 0.04, segments=64, spacing_m=0.002)
     left = mesh.vertices[:, 1:2] > 0.0
     surface = SpectralMesh(mesh, np.where(left, GREEN, RED).astype(np.float32), NM, np.ones(len(left), bool))
-    found = classified(surface, SpectralLibrary(("green",), NM, GREEN[None]), 0.1, smallest_region_m2=1e-6)
+    found = classified(surface, SpectralLibrary(("green",), NM, GREEN[None]), 0.1)
     np.testing.assert_array_equal(found.mixture_labels, np.where(left[:, 0], 0, -1))
     assert found.mixture_areas_m2 == pytest.approx(found.areas_m2)

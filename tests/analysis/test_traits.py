@@ -65,7 +65,7 @@ def test_angles_and_classes_do_not_depend_on_brightness():
 
 def test_class_areas_and_regions_of_two_halves():
     surface = two_halves()
-    classes = classified(surface, LIBRARY, 0.1, smallest_region_m2=1e-6)
+    classes = classified(surface, LIBRARY, 0.1)
     half_m2 = surface.mesh.area_m2() / 2.0
     np.testing.assert_allclose(classes.areas_m2, half_m2, rtol=0.04)
     assert classes.areas_m2.sum() + classes.unclassified_m2 == pytest.approx(surface.mesh.area_m2())
@@ -78,7 +78,7 @@ def test_references_of_one_name_are_one_class():
     surface = two_halves()
     names = ("green", "brown", "green")
     library = SpectralLibrary(names, NM, np.stack([GREEN[::-1], BROWN, GREEN]))
-    classes = classified(surface, library, 0.1, smallest_region_m2=1e-6)
+    classes = classified(surface, library, 0.1)
     assert classes.names == ("green", "brown")
     np.testing.assert_allclose(classes.areas_m2, surface.mesh.area_m2() / 2.0, rtol=0.04)
     assert library.only(("green",)).names == ("green", "green")
@@ -100,7 +100,7 @@ def test_regions_that_do_not_touch_are_two_and_small_ones_are_not_listed():
 def test_what_was_not_seen_is_in_no_class_and_no_mean():
     surface = two_halves()
     hidden = SpectralMesh(surface.mesh, surface.spectra, NM, surface.mesh.vertices[:, 1] > 0.0)
-    classes = classified(hidden, LIBRARY, 0.1, 1e-6)
+    classes = classified(hidden, LIBRARY, 0.1)
     assert classes.areas_m2[1] == 0.0
     traits = analyse(hidden, classes=classes)
     assert [region.name for region in traits.regions] == [WHOLE, "green"]
