@@ -100,11 +100,13 @@ def require_format(path_without_suffix: Path, file_format: CloudFormat, num_band
                 f"the format {file_format} needs the package {_PACKAGES[file_format]}, which is not installed; run "
                 "`pip install 'hsi-sc-nerf[formats]'`, or export as PLY."
             ) from error
-    room = LAS_MAX_DIMENSIONS - len(_LAS_NORMALS) - num_extra
+    material = num_bands if num_extra >= num_bands else 0  # columns of the material, one a band
+    room = (LAS_MAX_DIMENSIONS - len(_LAS_NORMALS) - (num_extra - material)) // (2 if material else 1)
     if file_format == "las" and num_bands > room:
         raise InputError(
-            f"{path}: LAS has room for {room} bands and the cloud has {num_bands}; choose some with --bands, or "
-            "export as PLY."
+            f"{path}: LAS has room for {room} bands and the cloud has {num_bands}"
+            f"{' with as many columns of the material' if material else ''}; export it with fewer bands (--bands), "
+            "or write .ply or .nc."
         )
     if file_format == "zarr" and path.exists() and not (path / "zarr.json").is_file():
         raise InputError(f"{path}: is not a Zarr folder and is not replaced by one; choose another output folder.")

@@ -66,7 +66,7 @@ def from_xarray(table: xarray.Dataset) -> SpectralCloud:
     """The cloud in a dataset that `to_xarray` or a cloud's NetCDF file or Zarr folder gave.
 
     Raises:
-        InputError: a variable of a cloud is missing, or has other dimensions.
+        InputError: a variable of a cloud is missing, or has other dimensions, or one of the points holds no numbers.
 
     Example:
         >>> table = to_xarray(read_spectral_ply("point_cloud.ply"))
@@ -79,7 +79,12 @@ def from_xarray(table: xarray.Dataset) -> SpectralCloud:
         lacking = ", ".join(missing) or "reflectance (point, wavelength)"
         raise InputError(f"the table has no {lacking}; give one that to_xarray or `hsi-sc-nerf export` made.")
     wavelengths_nm = table["wavelength"].values
-    others = (name for name in table.variables if name not in needed and table[name].dims == ("point",))
+    others = [name for name in table.variables if name not in needed and table[name].dims == ("point",)]
+    if no_numbers := [str(name) for name in others if table[name].dtype.kind not in "biuf"]:
+        raise InputError(
+            f"the table's {', '.join(no_numbers)} holds no numbers, which alone a cloud has for its points; drop it "
+            f"(table.drop_vars({no_numbers})), or give numbers in its place."
+        )
     extra = {str(name): table[name].values for name in others}
     if "material" in table:
         extra |= zip(band_property_names(wavelengths_nm, "material"), table["material"].values.T, strict=True)

@@ -37,6 +37,9 @@ def test_las_refuses_more_bands_than_it_holds(tmp_path: Path) -> None:
     write_cloud(tmp_path / "fits", stream(random_cloud(2, np.linspace(400.0, 1000.0, 336))), "las")
     with pytest.raises(InputError, match=r"cloud\.las: .* 336 bands.* 337.*--bands"):
         require_format(tmp_path / "cloud", "las", 337, 2)
+    require_format(tmp_path / "cloud", "las", 166, 166 + 6)
+    with pytest.raises(InputError, match=r"166 bands.* 167 .*material.*--bands"):
+        require_format(tmp_path / "cloud", "las", 167, 167 + 6)
 
 
 @pytest.mark.slow

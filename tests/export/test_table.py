@@ -50,3 +50,13 @@ def test_a_table_of_something_else_is_refused():
         from_xarray(table.drop_vars("nx"))
     with pytest.raises(InputError, match=r"reflectance \(point, wavelength\)"):
         from_xarray(table.transpose())
+
+
+def test_columns_of_points_are_numbers_or_truth():
+    table = to_xarray(random_cloud())
+    table["good"] = ("point", np.arange(50) % 2 == 0)
+    np.testing.assert_array_equal(from_xarray(table).extra["good"], table["good"])
+    for texts in (np.array(["stem", "body"] * 25), np.array(["stem", "body"] * 25, object)):
+        table["organ"] = ("point", texts)
+        with pytest.raises(InputError, match="organ holds no numbers"):
+            from_xarray(table)
