@@ -115,11 +115,13 @@ class RenderedView:
         spectral: reflectance; transparent pixels include the background's.
         opacity: fraction of each pixel that the model's scene covers, in [0, 1].
         depth: distance from the camera along each pixel's ray, scene units.
+        model: that rendered it along rays as its pose refinement corrects them; None for rays as they are.
     """
 
     spectral: Float[torch.Tensor, "h w bands"]
     opacity: Float[torch.Tensor, "h w"]
     depth: Float[torch.Tensor, "h w"]
+    model: SpectralModel | None = None
 
     @property
     def valid(self) -> Bool[torch.Tensor, "h w"]:
@@ -136,13 +138,17 @@ def render_view(model: SpectralModel, camera: Cameras) -> RenderedView:
     """
     outputs = model.get_outputs_for_camera(camera.to(model.device))
     return RenderedView(
-        outputs["spectral"].cpu(), outputs["accumulation"][..., 0].cpu(), outputs["depth"][..., 0].cpu()
+        outputs["spectral"].cpu(), outputs["accumulation"][..., 0].cpu(), outputs["depth"][..., 0].cpu(), model
     )
 
 
+@torch.no_grad()
 def visible_points(camera: Cameras, view: RenderedView) -> Float[np.ndarray, "h w 3"]:
     """Where each pixel's ray ends, scene units; NaN where a pixel is not `RenderedView.valid`."""
-    rays = camera.to("cpu").generate_rays(0)
+    rays = camera.to("cpu" if view.model is None else view.model.device).generate_rays(0)
+    if view.model is not None:
+        view.model.camera_optimizer.apply_to_raybundle(rays)
+    rays = rays.to("cpu")
     points = rays.origins + rays.directions * view.depth[..., None]
     return torch.where(view.valid[..., None], points, torch.nan).numpy()
 

@@ -1,4 +1,6 @@
 import json
+from dataclasses import replace
+from types import SimpleNamespace
 
 import av
 import ball_run
@@ -10,13 +12,21 @@ import torch
 from PIL import Image
 
 from hsi_sc_nerf.cli.trained_runs import RenderCommand
+from hsi_sc_nerf.data.dataparser import pinhole_cameras
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.geometry.camera import in_camera_frame, pixel_rays
 from hsi_sc_nerf.models.trained_run import open_trained_run
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.rendering.pictures import find_false_colour, open_video
-from hsi_sc_nerf.rendering.views import RenderedView, views_of_orbit, views_of_path, write_view
+from hsi_sc_nerf.rendering.views import (
+    RenderedView,
+    render_view,
+    views_of_orbit,
+    views_of_path,
+    visible_points,
+    write_view,
+)
 from hsi_sc_nerf.spectra import COMPOSITES
 
 NM = factory.WAVELENGTHS_NM
@@ -203,6 +213,27 @@ def test_views_of_the_material_show_the_cloud_that_tells_it(tmp_path, run, kind)
     np.testing.assert_allclose(measured[inside] / 0.8, found[inside], atol=4e-3)
     # SPy divides a value without data as well.
     assert (np.isnan(found[outside]) if kind == "float32" else found[outside] > 1.3).all()
+
+
+def test_points_that_a_view_shows_lie_on_the_rays_as_the_model_refines_them(dataset):
+    poses, shift = (
+        np.stack([frame.camera_to_world for frame in dataset.frames[:1]]),
+        torch.tensor([0.02, -0.01, 0.03]),
+    )
+    camera = pinhole_cameras(poses, dataset.intrinsics, dataset.distortion)
+    lines, samples = dataset.intrinsics.h, dataset.intrinsics.w
+    names = {"spectral": len(NM), "accumulation": 1, "depth": 1}
+    outputs = {name: torch.ones(lines, samples, channels) for name, channels in names.items()}
+
+    def move(rays):
+        rays.origins = rays.origins + torch.nn.Parameter(shift)
+
+    model = SimpleNamespace(device="cpu", get_outputs_for_camera=lambda camera: outputs)
+    model.camera_optimizer = SimpleNamespace(apply_to_raybundle=move)
+    view = render_view(model, camera)
+    moved, as_measured = (visible_points(camera, one) for one in (view, replace(view, model=None)))
+    np.testing.assert_allclose(np.linalg.norm(as_measured - poses[0, :3, 3], axis=-1), 1.0, atol=1e-5)
+    np.testing.assert_allclose(moved - as_measured, np.broadcast_to(shift, moved.shape), atol=1e-6)
 
 
 def test_an_orbit_of_another_size_without_cubes(tmp_path, run):
