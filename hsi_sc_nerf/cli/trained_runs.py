@@ -61,8 +61,9 @@ class SampleCommand:
     """Add spectra of a trained run to the points of any PLY file, such as a scanner's cloud or a mesh.
 
     The points must be in the object frame: origin where the turntable's axis meets the disc, z up along the axis.
-    Content of the file is kept, but for columns that a run measured. Each point gets its reflectance in every band, averaged over training views, the
-    number of these views (sampled_views) and the standard deviation over them (sampled_std).
+    Content of the file is kept, but for columns that a run measured. Each point gets its reflectance in every band,
+    averaged over training views, the number of these views (sampled_views) and the standard deviation over them
+    (sampled_std).
     """
 
     points: tyro.conf.Positional[Path]
