@@ -99,11 +99,13 @@ def _without_digits(name: str) -> str:
 def _in_natural_order(paths: Iterable[Path]) -> list[Path]:
     """Sorted so that frame_9 comes before frame_10."""
 
-    def key(path: Path) -> list[tuple[int, str]]:
-        parts = re.split(r"(\d+)", path.name.lower().removesuffix(".hdr"))
-        return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
+    return sorted(paths, key=lambda path: natural_order(path.name))
 
-    return sorted(paths, key=key)
+
+def natural_order(name: str) -> list[tuple[int, str]]:
+    """Key by which names of captures or their headers are sorted."""
+    parts = re.split(r"(\d+)", name.lower().removesuffix(".hdr"))
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
 
 
 def _headers_in(path: Path) -> dict[str, Path]:

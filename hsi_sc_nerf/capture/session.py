@@ -22,12 +22,10 @@ from hsi_sc_nerf.capture.instrument import (
     usual_rotation_deg,
     with_band_widths,
 )
+from hsi_sc_nerf.capture.roles import damaged_captures, turn_of, white_name, with_angles_of
 from hsi_sc_nerf.capture.session_info import SESSION_INFO_NAME, SessionInfo, read_band_centres, read_session_info
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.spectra import SAME_BAND_NM, listed_twice
-
-# Words in the name of a white reference that nobody named in session.json.
-_WHITE_WORDS = ("white", "tarp", "spectralon", "panel")
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +89,7 @@ class Session:
         damaged: captures that cannot be used and are left out, by name, with the reason.
         skipped: folders and cubes that are no captures, by name, with the reason.
         excluded: captures that the user leaves out.
+        turn: names of all captures of the turning object in their order, with those that are damaged or excluded.
     """
 
     path: Path
@@ -101,11 +100,17 @@ class Session:
     damaged: Mapping[str, str] = field(default_factory=dict)
     skipped: Mapping[str, str] = field(default_factory=dict)
     excluded: tuple[str, ...] = ()
+    turn: tuple[str, ...] = ()
 
     @property
     def captures(self) -> tuple[Capture, ...]:
         """The tarp, if there is one, and the frames."""
         return self.frames if self.white is None else (self.white, *self.frames)
+
+    @property
+    def places(self) -> tuple[int, ...]:
+        """Each frame's place in the turn: the table turned for the captures that are left out, too."""
+        return tuple(self.turn.index(frame.name) for frame in self.frames)
 
     @property
     def wavelengths_nm(self) -> Float[np.ndarray, "bands"]:
@@ -189,15 +194,15 @@ def open_session(path: Path, *, exclude: Collection[str] = (), skip_damaged: boo
     damaged = {name: reason for name, reason in found.damaged.items() if name not in exclude}
     kept = [files for files in found.captures if files.name not in exclude]
     captures = open_captures(kept, info, path, damaged)
-    info = replace(info, white_reference=name_of_white(info, [*(files.name for files in kept), *damaged]))
-    white_name = info.white_reference.lower()
-    broken_white = next((reason for name, reason in damaged.items() if name.lower() == white_name), None)
+    info = replace(info, white_reference=white_name(info, [*(files.name for files in kept), *damaged]))
+    white = info.white_reference.lower()
+    broken_white = next((reason for name, reason in damaged.items() if name.lower() == white), None)
     if broken_white is None and damaged and not captures:  # all for the same reason, most likely
         broken_white = next(iter(damaged.values()))
     if broken_white is not None:
         raise InputError(f"{broken_white}.")
-    tarp = next((c for c in captures if c.name.lower() == white_name and c.has_counts), None)
-    frames = [capture for capture in captures if capture.name.lower() != white_name]
+    tarp = next((c for c in captures if c.name.lower() == white and c.has_counts), None)
+    frames = [capture for capture in captures if capture.name.lower() != white]
     frames = _consistent(frames, tarp, damaged)
     if damaged and not skip_damaged:
         raise InputError(damaged_captures(path, damaged))
@@ -209,29 +214,19 @@ def open_session(path: Path, *, exclude: Collection[str] = (), skip_damaged: boo
     rotation_deg = info.image_rotation_deg
     if rotation_deg is None:
         rotation_deg = usual_rotation_deg(frames[0].cube)
+    names = [frame.name for frame in frames]
+    not_opened = {files.name for files in found.captures} - {capture.name for capture in captures}
+    turn = turn_of(names, {*not_opened, *found.damaged, *damaged})
     return Session(
-        path, info, tarp, tuple(frames), rotation_deg, damaged=damaged, skipped=found.skipped, excluded=tuple(exclude)
-    )
-
-
-def name_of_white(info: SessionInfo, names: list[str]) -> str:
-    """The stated name of the white reference; if none is stated, that of the only capture named like a white."""
-    stated = info.white_reference != SessionInfo.white_reference
-    if stated or info.white_reference in (name.lower() for name in names):
-        return info.white_reference
-    telling = [name for name in names if any(word in name.lower() for word in _WHITE_WORDS)]
-    return telling[0] if len(telling) == 1 else info.white_reference
-
-
-def in_short(damaged: Mapping[str, str]) -> str:
-    """Captures that cannot be used, each with the reason."""
-    return ", ".join(f"{name} ({reason.split(': ', 1)[-1].split('; ')[0]})" for name, reason in damaged.items())
-
-
-def damaged_captures(path: Path, damaged: Mapping[str, str]) -> str:
-    """The sentence that refuses a session with captures that cannot be used."""
-    return (
-        f"{path}: {in_short(damaged)} cannot be used; copy the captures again, or leave them out with --skip-damaged."
+        path,
+        with_angles_of(info, names, turn),
+        tarp,
+        tuple(frames),
+        rotation_deg,
+        damaged=damaged,
+        skipped=found.skipped,
+        excluded=tuple(exclude),
+        turn=turn,
     )
 
 

@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import median_abs_deviation
 
-from hsi_sc_nerf.capture.session import Capture, Session, damaged_captures, in_short
+from hsi_sc_nerf.capture.roles import damaged_captures, in_short
+from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.findings import Finding, Level, leave_out, names_in_short
 from hsi_sc_nerf.inspection.quicklook import Quicklook, saturation_level
 from hsi_sc_nerf.poses.marker_detection import Detections

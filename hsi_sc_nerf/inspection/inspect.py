@@ -19,13 +19,13 @@ from hsi_sc_nerf.calibration.white_source import WhiteSource
 from hsi_sc_nerf.capture.session import Session, open_session
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.findings import Finding
+from hsi_sc_nerf.findings import Finding, names_in_short
 from hsi_sc_nerf.inspection.capture_checks import check_files, check_frames
 from hsi_sc_nerf.inspection.marker_checks import Markers, check_markers, find_markers
 from hsi_sc_nerf.inspection.paper_check import check_paper
 from hsi_sc_nerf.inspection.quicklook import Quicklook, quicklooks_of
 from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure, show_image
-from hsi_sc_nerf.poses.feature_poses import known_angles_deg, required_angles_deg
+from hsi_sc_nerf.poses.known_angles import known_angles_deg, required_angles_deg
 from hsi_sc_nerf.poses.pose_methods import PoseMethod
 
 WHOLE_TURN_DEG = 0.05
@@ -181,13 +181,26 @@ def check_scale(session: Session, poses: PoseMethod, scale_known: bool) -> Findi
 
 
 def check_angles(session: Session, poses: PoseMethod, markers: Markers) -> list[Finding]:
-    """The finding ``angles`` if those of ``session.json`` cannot be used, or are needed and missing."""
+    """The finding ``angles`` if those of ``session.json`` cannot be used or are needed and missing, or rest on an
+    assumption about captures that are left out."""
+    info, places = session.info, session.places
     needed = poses == "angles" or (poses == "auto" and markers.dictionary is None)
     try:
-        (required_angles_deg if poses == "angles" else known_angles_deg)(session.info, len(session.frames))
+        (required_angles_deg if poses == "angles" else known_angles_deg)(info, places)
     except InputError as error:
         return [Finding("angles", "red" if needed else "amber", f"{session.info_path}: {error}.")]
-    return []
+    step, frames = info.nominal_step_deg, {frame.name for frame in session.frames}
+    gaps = [name for name in session.turn[places[0] : places[-1]] if name not in frames]
+    if step is None or info.frame_angles_deg is not None or not gaps:
+        return []
+    sentence = (
+        f"The table is taken to have turned by a nominal step for {names_in_short(gaps)}, too, left out between "
+        f"{session.frames[0].name} and {session.frames[-1].name}; if it did not, give frame_angles_deg."
+    )
+    values = dict(
+        zip([frame.name for frame in session.frames], [step * (p - places[0]) for p in places], strict=True)
+    )
+    return [Finding("angles", "amber" if needed or poses == "colmap" else "green", sentence, values)]
 
 
 def draw_inspection(inspection: Inspection, path: Path) -> None:

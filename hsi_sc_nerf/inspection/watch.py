@@ -8,7 +8,8 @@ import numpy as np
 
 from hsi_sc_nerf.calibration.detector import DIGITISER_LIMITS
 from hsi_sc_nerf.capture.instrument import CaptureFiles, list_captures
-from hsi_sc_nerf.capture.session import Capture, name_of_white, open_captures
+from hsi_sc_nerf.capture.roles import white_name
+from hsi_sc_nerf.capture.session import Capture, open_captures
 from hsi_sc_nerf.capture.session_info import SESSION_INFO_NAME, SessionInfo, read_session_info
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.inspection.capture_checks import BLURRED, DARK_RED, SATURATED_RED, acquisition_day
@@ -58,7 +59,7 @@ class Watch:
         except (InputError, OSError) as error:
             self.incomplete = waited_for
             return self._once(str(error))
-        white = name_of_white(self._info, [files.name for files in found]).lower()
+        white = white_name(self._info, [files.name for files in found]).lower()
         for files in (files for files in found if files.name not in self._seen):
             opened = open_captures([files], self._info, self.path, self.incomplete)
             if not opened:

@@ -19,6 +19,7 @@ from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, turntable_camera_to_world
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters
 from hsi_sc_nerf.poses.container_outline import container_outline
+from hsi_sc_nerf.poses.known_angles import known_angles_deg, required_angles_deg
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_observations import observe_markers
 from hsi_sc_nerf.poses.model_selection import usable
@@ -80,36 +81,12 @@ class KnownCamera:
             )
 
 
-def known_angles_deg(info: SessionInfo, frames: int) -> Float[np.ndarray, "n"] | None:
-    """The frames' angles by ``session.json``, relative to the first; positive where the direction is not known.
-
-    Raises:
-        InputError: not one angle per frame.
-    """
-    sign = -1.0 if info.direction == "cw" else 1.0
-    if info.frame_angles_deg is not None:
-        if len(info.frame_angles_deg) != frames:
-            raise InputError(
-                f"{len(info.frame_angles_deg)} frame angles are given for {frames} frames; give one per frame"
-            )
-        return sign * (np.array(info.frame_angles_deg) - info.frame_angles_deg[0])
-    return None if info.nominal_step_deg is None else sign * info.nominal_step_deg * np.arange(frames)
-
-
-def required_angles_deg(info: SessionInfo, frames: int) -> Float[np.ndarray, "n"]:
-    """`known_angles_deg`, which must be known.
-
-    Raises:
-        InputError: they are not known, or not one angle per frame is given.
-    """
-    angles_deg = known_angles_deg(info, frames)
-    if angles_deg is None:
-        raise InputError("the angles are not known; give nominal_step_deg or frame_angles_deg in session.json")
-    return angles_deg
-
-
 def poses_from_known_camera(
-    names: Sequence[str], size_px: tuple[int, int], info: SessionInfo, camera: KnownCamera
+    names: Sequence[str],
+    size_px: tuple[int, int],
+    info: SessionInfo,
+    camera: KnownCamera,
+    places: Sequence[int] | None = None,
 ) -> TurntablePoses:
     """Poses of a camera that has not moved since an earlier session, from known angles alone, without measurement.
 
@@ -117,6 +94,7 @@ def poses_from_known_camera(
         size_px: width and height of the images.
         info: the angles and the direction.
         camera: camera of the earlier session; its direction counts where ``info`` has none.
+        places: each frame's place in the turn (`Session.places`); one after the other if not given.
 
     Raises:
         InputError: images of another size than the camera's, unknown angles, or an unknown direction: the poses might
@@ -124,7 +102,7 @@ def poses_from_known_camera(
     """
     camera.check_size(size_px)
     direction, n = info.direction or camera.direction, len(names)
-    angles_deg = required_angles_deg(info, n)
+    angles_deg = required_angles_deg(info, range(n) if places is None else places)
     if direction is None:
         raise InputError(
             "which way the turntable turns is not known, neither from session.json nor from the angles of the "
@@ -154,6 +132,7 @@ def poses_from_sfm(
     *,
     camera: KnownCamera | None = None,
     hold_angles: bool = False,
+    places: Sequence[int] | None = None,
     free: FreePoses | None = None,
 ) -> TurntablePoses:
     """Poses from features: free poses by COLMAP, a turntable fitted to them, and its bundle adjustment.
@@ -164,6 +143,7 @@ def poses_from_sfm(
         info: what gives the scale, the markers' dictionary, and the angles.
         camera: camera of an earlier session, whose focal length and distance from the axis still hold.
         hold_angles: take the known angles for exact; their direction is that of the images.
+        places: each frame's place in the turn (`Session.places`); one after the other if not given.
         free: what ``structure_from_motion`` finds with the camera's focal length, where it is known already.
 
     Raises:
@@ -173,7 +153,8 @@ def poses_from_sfm(
     height, width = images[0].shape
     if camera is not None:
         camera.check_size((width, height))
-    angles_deg = (required_angles_deg if hold_angles else known_angles_deg)(info, len(names))
+    places = range(len(names)) if places is None else places
+    angles_deg = (required_angles_deg if hold_angles else known_angles_deg)(info, places)
     grays = SessionPictures.of(images).named(GRAY)
     if free is None:
         free = structure_from_motion(grays, names, focal_px=None if camera is None else camera.intrinsics.fl_x)

@@ -31,7 +31,7 @@ def find_poses(
     method: PoseMethod = "auto",
     *,
     camera: KnownCamera | None = None,
-    from_markers: Callable[..., TurntablePoses] = poses_from_markers,
+    places: Sequence[int] | None = None,
     from_sfm: Callable[..., TurntablePoses] = poses_from_sfm,
 ) -> TurntablePoses:
     """Poses by one method, or by the first that works; the result names the method and why it was used.
@@ -42,7 +42,7 @@ def find_poses(
         method: ``auto`` takes the first of ``markers``, ``colmap`` and ``angles`` that works.
         camera: of an earlier session; poses from features start from its focal length, and with known angles poses
             need neither markers nor texture.
-        from_markers: called like `poses_from_markers`.
+        places: each frame's place in the turn (`Session.places`), where captures are left out.
         from_sfm: called like `poses_from_sfm`.
 
     Raises:
@@ -56,13 +56,13 @@ def find_poses(
 
     def by(method: str) -> TurntablePoses:
         if method == "markers":
-            return from_markers(images, names, info)
+            return poses_from_markers(images, names, info)
         if method == "colmap":
-            return _checked(from_sfm(images, names, info, camera=camera))
+            return _checked(from_sfm(images, names, info, camera=camera, places=places))
         if camera is None:
-            return _checked(from_sfm(images, names, info, hold_angles=True))
+            return _checked(from_sfm(images, names, info, hold_angles=True, places=places))
         height, width = images[0].shape
-        return poses_from_known_camera(names, (width, height), info, camera)
+        return poses_from_known_camera(names, (width, height), info, camera, places)
 
     # Many small systems of equations are solved side by side, which BLAS's own threads would slow down.
     with threadpool_limits(limits=1, user_api="blas"):

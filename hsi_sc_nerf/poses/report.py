@@ -13,6 +13,7 @@ from matplotlib import rc_context
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.findings import Finding, Level, names_in_short
 from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure
+from hsi_sc_nerf.poses.known_angles import check_angles, step_deviation_deg
 from hsi_sc_nerf.poses.result import TurntablePoses, is_full_turn
 
 # The paper's target for the reprojection error (section "Pose Estimation").
@@ -25,10 +26,6 @@ _LARGEST_PLAQUE_PERCENT = 2.5
 _DISTANCE_PERCENT = 5.0
 # A marker's side is odd if it differs by this and by this many standard deviations.
 _ODD_SIDE, _ODD_SIDE_SIGMAS = 0.01, 4.0
-# A turntable's step differs from its nominal one by up to this fraction; a single angle by up to this one.
-_STEP_TOLERANCE, _ANGLE_TOLERANCE = 0.05, 0.25
-# Given angles differ from found ones by up to this.
-_ANGLE_DEG = 1.0
 # Standard deviations, degrees, millimetres and percent of the scale: the goal, and what spoils a reconstruction.
 _GOAL, _UNUSABLE = (0.3, 1.5, 0.5), (1.0, 10.0, 5.0)
 # So many frames that are left out for one reason are named in the finding; poses.json has all.
@@ -40,12 +37,13 @@ _AXIS_OVER_LARGEST = 1.4
 _TITLE_CHARACTERS = 150
 
 
-def check_poses(poses: TurntablePoses, info: SessionInfo) -> list[Finding]:
+def check_poses(poses: TurntablePoses, info: SessionInfo, places: Sequence[int] | None = None) -> list[Finding]:
     """Check the poses against each other and against what is known of the session.
 
     Args:
         poses: poses of the session.
         info: what is known of the session: the container's size, the nominal step and the direction.
+        places: each frame's place in the turn (`Session.places`); one after the other if not given.
 
     Example:
         >>> refuse_red(check_poses(poses, info), accepted=["poses-scale"])
@@ -62,21 +60,10 @@ def check_poses(poses: TurntablePoses, info: SessionInfo) -> list[Finding]:
     return [
         *found,
         *_check_uncertainty(poses),
-        *_check_angles(poses, info),
+        *check_angles(poses, info, range(len(poses.names)) if places is None else places),
         *_check_scale(poses),
         *_check_distance(poses, info),
     ]
-
-
-def step_deviation_deg(poses: TurntablePoses, info: SessionInfo) -> float | None:
-    """Largest departure of a used frame's angle from its index times the nominal step; None where that is unknown."""
-    if info.nominal_step_deg is None:
-        return None
-    index = np.flatnonzero(poses.used)
-    angles = poses.angles_deg[poses.used]
-    step = np.copysign(info.nominal_step_deg, np.median(np.diff(angles)))
-    deviation_deg = angles - step * (index - index[0])
-    return float(np.abs((deviation_deg + 180.0) % 360.0 - 180.0).max())
 
 
 def _check_uncertainty(poses: TurntablePoses) -> list[Finding]:
@@ -91,42 +78,6 @@ def _check_uncertainty(poses: TurntablePoses) -> list[Finding]:
     advice = f"; show {show}, or give --camera, an earlier dataset of the same camera."
     values = {"rotation_deg": known[0], "position_mm": known[1], "scale_percent": known[2]}
     return [Finding("poses-uncertain", level, sentence + ("." if level == "green" else advice), values)]
-
-
-def _check_angles(poses: TurntablePoses, info: SessionInfo) -> list[Finding]:
-    found = []
-    steps = np.diff(poses.angles_deg[poses.used]) / np.diff(np.flatnonzero(poses.used))
-    median = float(np.median(steps))
-    direction = "ccw" if median > 0.0 else "cw"
-    if info.direction and info.direction != direction:
-        sentence = (
-            f"session.json says that the turntable turns {info.direction}, the images show {direction}; correct it."
-        )
-        found.append(Finding("poses-direction", "red", sentence, {"given": info.direction, "found": direction}))
-    if info.frame_angles_deg is not None and len(info.frame_angles_deg) == len(poses.used):
-        given = np.copysign(1.0, median) * np.abs(np.array(info.frame_angles_deg) - info.frame_angles_deg[0])
-        difference_deg = (poses.angles_deg - given)[poses.used]
-        difference_deg = np.abs((difference_deg - np.median(difference_deg) + 180.0) % 360.0 - 180.0)
-        typical, largest = float(np.median(difference_deg)), float(difference_deg.max())
-        if largest > _ANGLE_DEG:
-            level: Level = "red" if typical > _ANGLE_DEG else "amber"
-            sentence = f"Angles depart from frame_angles_deg by {typical:.1f} to {largest:.1f} degrees."
-            found.append(Finding("poses-angles", level, sentence, {"largest_deviation_deg": largest}))
-        return found
-    nominal, deviation = info.nominal_step_deg, step_deviation_deg(poses, info)
-    if nominal is None or deviation is None:
-        return found
-    values = {"nominal_step_deg": nominal, "median_step_deg": abs(median), "largest_deviation_deg": deviation}
-    if abs(abs(median) - nominal) > _STEP_TOLERANCE * nominal:
-        sentence = (
-            f"The frames are {abs(median):.2f} degrees apart, but nominal_step_deg is {nominal:g}; correct it, or "
-            "show markers."
-        )
-        found.append(Finding("poses-angles", "red", sentence, values))
-    elif deviation > _ANGLE_TOLERANCE * nominal:
-        sentence = f"An angle departs from the nominal steps by {deviation:.1f} degrees; compare with your notes."
-        found.append(Finding("poses-angles", "amber", sentence, values))
-    return found
 
 
 def _check_scale(poses: TurntablePoses) -> list[Finding]:
@@ -181,8 +132,18 @@ def _left_out(poses: TurntablePoses) -> str:
     return f"{len(poses.dropped)} of {len(poses.names)} frames are left out: {'; '.join(groups)}."
 
 
-def pose_report(poses: TurntablePoses, info: SessionInfo, findings: Sequence[Finding] = ()) -> dict:
-    """Figures and findings of an estimate; unknown numbers are None."""
+def pose_report(
+    poses: TurntablePoses,
+    info: SessionInfo,
+    findings: Sequence[Finding] = (),
+    places: Sequence[int] | None = None,
+) -> dict:
+    """Figures and findings of an estimate; unknown numbers are None.
+
+    Args:
+        places: as for `check_poses`.
+    """
+    places = range(len(poses.names)) if places is None else places
     steps = np.diff(poses.angles_deg[poses.used])
     full_turn = is_full_turn(poses.angles_deg[poses.used])
     # The mean axis in the camera's axes: right, up, backwards.
@@ -208,7 +169,7 @@ def pose_report(poses: TurntablePoses, info: SessionInfo, findings: Sequence[Fin
             "median": float(np.median(steps)),
             "smallest": float(steps.min()),
             "largest": float(steps.max()),
-            "largest_deviation_from_nominal": step_deviation_deg(poses, info),
+            "largest_deviation_from_nominal": step_deviation_deg(poses, info, places),
         },
         "direction": {"nominal": info.direction, "found": "ccw" if np.median(steps) > 0 else "cw"},
         "full_turn": full_turn,

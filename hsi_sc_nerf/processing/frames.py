@@ -249,7 +249,9 @@ def session_fingerprint(session: Session, config: Any, files: Iterable[Path] = (
     """
     named = _stamps(session.path, [path for path in files if path.is_file()])
     settings = {name: value for name, value in asdict(config).items() if name not in _NOT_IN_RESULT}
-    return fingerprint([session_files(session), settings, named])
+    # A damaged capture takes a place in the turn.
+    places = [session.places] if session.damaged else []
+    return fingerprint([session_files(session), settings, named, *places])
 
 
 def fingerprint(content: Any) -> str:

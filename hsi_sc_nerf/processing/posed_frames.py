@@ -60,11 +60,13 @@ def pose_frames(
         pictures = read_pictures([p.cube for p in paths], [p.flags for p in paths], images)
     try:
         with console.status("finding poses"):
-            poses = find_poses(pictures or images, names, info=info, method=method, camera=camera)
+            poses = find_poses(
+                pictures or images, names, info=info, method=method, camera=camera, places=session.places
+            )
     except InputError as error:
         raise InputError(f"{session.path}: {error}") from error
-    findings = check_poses(poses, info)
-    report = pose_report(poses, info, findings)
+    findings = check_poses(poses, info, session.places)
+    report = pose_report(poses, info, findings, session.places)
     if pictures is not None:
         report["pictures"] = {
             "best": {name: frame.ranking[0] for name, frame in zip(names, pictures.frames, strict=True)},

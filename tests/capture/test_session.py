@@ -125,6 +125,30 @@ def test_all_damaged_captures_are_named_at_once_and_the_first_frame_may_be_one(t
     assert [frame.name for frame in open_session(tmp_path, skip_damaged=True).frames] == ["ball_2", "ball_3"]
 
 
+@pytest.mark.parametrize(
+    ("left_out", "names", "places"),
+    [
+        ({}, ["ball_1", "ball_2", "ball_3", "ball_4"], (0, 1, 2, 3)),
+        ({"skip_damaged": True}, ["ball_1", "ball_3", "ball_4"], (0, 2, 3)),
+        ({"exclude": ["ball_2", "tarp_3"]}, ["ball_1", "ball_3", "ball_4"], (0, 2, 3)),
+        ({"exclude": ["ball_1"], "skip_damaged": True}, ["ball_3", "ball_4"], (2, 3)),
+    ],
+)
+@pytest.mark.parametrize("specim", [True, False])
+def test_a_capture_that_is_left_out_keeps_its_place_in_the_turn(tmp_path, specim, left_out, names, places):
+    angles_deg = [0, 90, 180, 270] if "exclude" not in left_out else [0, 90, 180, 271]
+    write_session(tmp_path, specim=specim, info={**INFO, "frame_angles_deg": angles_deg})
+    if "skip_damaged" in left_out:
+        (next(tmp_path.rglob("ball_2.*[!r]"))).write_bytes(b"")
+    if "tarp_3" in left_out.get("exclude", ()):
+        write_capture(tmp_path, "tarp_3", COUNTS, specim=specim)
+    session = open_session(tmp_path, **left_out)
+    assert ([frame.name for frame in session.frames], session.places) == (names, places)
+    assert session.info.frame_angles_deg == tuple(angles_deg[place] for place in places)
+    (tmp_path / "session.json").write_text(json.dumps({"frame_angles_deg": [0.5] * len(names)}))
+    assert open_session(tmp_path, **left_out).info.frame_angles_deg == (0.5,) * len(names)
+
+
 def test_a_damaged_white_is_not_left_out(tmp_path):
     write_session(tmp_path)
     no_bytes(tmp_path, "white_reference")

@@ -192,6 +192,25 @@ def test_angles_that_poses_need_are_asked_for_before_any_computing(session, stat
     assert [f.level for f in findings if f.name == "angles"] == ([] if level is None else [level])
 
 
+@pytest.mark.parametrize(
+    ("name", "stated", "poses", "level"),
+    [
+        ("fruit_05", {"nominal_step_deg": 30}, "angles", "amber"),
+        ("fruit_05", {"nominal_step_deg": 30}, "auto", "green"),
+        ("fruit_05", {"frame_angles_deg": list(range(0, 360, 30))}, "angles", None),
+        ("fruit_11", {"nominal_step_deg": 30}, "angles", None),
+    ],
+)
+def test_the_place_of_a_capture_that_is_left_out_is_stated(session, name, stated, poses, level):
+    (session / "session.json").write_text(json.dumps({**INFO, "nominal_step_deg": None, **stated}))
+    findings = inspect_session(open_session(session, exclude=[name]), poses).findings
+    angles = [finding for finding in findings if finding.name == "angles"]
+    assert [finding.level for finding in angles] == ([] if level is None else [level])
+    for finding in angles:
+        assert name in finding.sentence
+        assert finding.values["fruit_06"] == 180.0
+
+
 @pytest.mark.slow
 def test_without_session_json_it_is_written_for_the_user(good, tmp_path):
     session = Path(shutil.copytree(good, tmp_path / "fruits"))

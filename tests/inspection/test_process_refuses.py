@@ -13,8 +13,8 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
 
 
-def reached(images, names, **_):
-    raise InputError(f"reached the poses of {len(names)} frames")
+def reached(images, names, *, places, **_):
+    raise InputError(f"reached the poses of {len(names)} frames at {places}")
 
 
 def process(session: Path, output: Path, **settings) -> None:
@@ -50,7 +50,7 @@ def test_all_damaged_captures_are_named_or_left_out(session, tmp_path):
     shutil.rmtree(session / "fruit_08" / "capture")
     with pytest.raises(InputError, match=r"fruit_08.*fruit_02.*0 bytes"):
         process(session, tmp_path / "data")
-    with pytest.raises(InputError, match="reached the poses of 10"):
+    with pytest.raises(InputError, match=r"reached the poses of 10 frames at \(0, 1, 3, 4, 5, 6, 7, 9, 10, 11\)"):
         process(session, tmp_path / "data", skip_damaged=True)
 
 

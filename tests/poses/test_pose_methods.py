@@ -12,7 +12,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, rotation_about_z
 from hsi_sc_nerf.poses.feature_poses import KnownCamera, poses_from_sfm
 from hsi_sc_nerf.poses.pose_methods import find_poses
-from hsi_sc_nerf.poses.report import describe_poses, pose_report
+from hsi_sc_nerf.poses.report import check_poses, describe_poses, pose_report
 from hsi_sc_nerf.poses.result import Scale
 from hsi_sc_nerf.poses.structure_from_motion import structure_from_motion
 from hsi_sc_nerf.simulate.frames import Simulation
@@ -102,11 +102,12 @@ STEPS = SessionInfo(nominal_step_deg=90.0)
 
 
 def test_auto_says_why_not():
-    poses = find_poses(BLANK, list("abcd"), STEPS, camera=CAMERA, from_markers=fails, from_sfm=fails)
+    poses = find_poses(BLANK, list("abcd"), STEPS, camera=CAMERA, from_sfm=fails)
     assert poses.method == "angles"
-    assert poses.chosen == "by known angles (not by markers: it fails; nor by features (COLMAP): it fails)"
-    with pytest.raises(InputError, match="markers: it fails; features"):
-        find_poses(BLANK, list("abcd"), STEPS, from_markers=fails, from_sfm=fails)
+    assert poses.chosen.startswith("by known angles (not by markers: nothing gives the scale")
+    assert poses.chosen.endswith("; nor by features (COLMAP): it fails)")
+    with pytest.raises(InputError, match=r"markers: nothing gives the scale.*; features \(COLMAP\): it fails"):
+        find_poses(BLANK, list("abcd"), STEPS, from_sfm=fails)
 
 
 @pytest.mark.parametrize(
@@ -122,6 +123,39 @@ def test_an_earlier_camera_and_known_angles_are_enough(told, before, sign):
     assert poses.distortion == CAMERA.distortion
     assert pose_report(poses, info)["reprojection_error_px"]["overall"] is None
     assert [finding.name for finding in poses.findings] == ["poses-given"]
+
+
+@pytest.mark.parametrize(
+    ("given", "turned"),
+    [
+        ((270.0, 300.0, 330.0, 0.0), (0.0, 30.0, 60.0, 90.0)),
+        ((60.0, 30.0, 0.0, 330.0), (0.0, 30.0, 60.0, 90.0)),
+        ((0.0, -6.0, -12.0, -18.0), (0.0, 6.0, 12.0, 18.0)),
+        ((0.0, 180.0, 90.0, 270.0), (0.0, 180.0, 90.0, 270.0)),
+        ((0.0, 200.0, 400.0, 600.0), (0.0, 200.0, 400.0, 600.0)),
+    ],
+)
+@pytest.mark.parametrize(
+    ("told", "before", "sign"), [("ccw", None, 1.0), ("cw", "cw", -1.0), (None, "ccw", 1.0), (None, "cw", -1.0)]
+)
+def test_a_scale_may_start_again_and_count_down(given, turned, told, before, sign):
+    info = SessionInfo(frame_angles_deg=given, direction=told)
+    poses = find_poses(BLANK, list("abcd"), info, "angles", camera=replace(CAMERA, direction=before))
+    np.testing.assert_allclose(poses.angles_deg, sign * np.array(turned))
+    assert [finding.name for finding in check_poses(poses, info)] == ["poses-given"]
+
+
+def test_nominal_steps_count_captures_that_are_left_out():
+    places = (0, 1, 3, 4)
+    poses = find_poses(
+        BLANK, list("abcd"), replace(STEPS, nominal_step_deg=60.0), "angles", camera=CAMERA, places=places
+    )
+    np.testing.assert_allclose(poses.angles_deg, [0.0, 60.0, 180.0, 240.0])
+    seen = {}
+    find_poses(
+        BLANK, list("abcd"), STEPS, "colmap", places=places, from_sfm=lambda *_, **given: seen.update(given) or poses
+    )
+    assert seen["places"] == places
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 from capture_factory import true_poses
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
-from hsi_sc_nerf.poses.report import check_poses
+from hsi_sc_nerf.poses.report import check_poses, pose_report
 from hsi_sc_nerf.poses.result import Scale
 
 GOOD = true_poses([None] * 4, list("abcd"))
@@ -18,6 +18,13 @@ STEPS = SessionInfo(nominal_step_deg=90.0, direction="ccw")
 
 def levels(poses, info=STEPS):
     return {finding.name: finding.level for finding in check_poses(poses, info)}
+
+
+def test_places_of_captures_that_are_left_out_count():
+    gap, info = replace(GOOD, angles_deg=np.array([0.0, 60, 180, 240])), replace(STEPS, nominal_step_deg=60.0)
+    assert levels(gap, info) == {"poses-angles": "amber"}
+    assert check_poses(gap, info, (0, 1, 3, 4)) == []
+    assert pose_report(gap, info, places=(0, 1, 3, 4))["steps_deg"]["largest_deviation_from_nominal"] == 0.0
 
 
 @pytest.mark.parametrize(
@@ -32,6 +39,7 @@ def levels(poses, info=STEPS):
         (replace(GOOD, angles_deg=np.array([0.0, 90, 210, 270])), STEPS, {"poses-angles": "amber"}),
         (GOOD, SessionInfo(frame_angles_deg=(5.0, 95.0, 185.0, 275.5)), {}),
         (GOOD, SessionInfo(frame_angles_deg=(0.0, -90.0, -180.0, -270.0)), {}),
+        (GOOD, SessionInfo(frame_angles_deg=(270.0, 0.0, 90.0, 180.0)), {}),
         (GOOD, SessionInfo(frame_angles_deg=(0.0, 90.0, 180.0, 280.0)), {"poses-angles": "amber"}),
         (GOOD, SessionInfo(frame_angles_deg=(0.0, 80.0, 160.0, 240.0)), {"poses-angles": "red"}),
         (replace(GOOD, used=np.array([True, False, True, True])), STEPS, {}),
