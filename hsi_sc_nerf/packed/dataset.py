@@ -112,6 +112,7 @@ class PackedDataset:
             that could not be measured).
         typical_uncertainty: standard deviation by band at the object's mean reflectance; None likewise.
         pose_method: how the poses were estimated ("markers", "colmap", "angles"); None if that is unknown.
+        metric: whether lengths are metres; else nothing gave the scale: the camera's distance from the axis is 1.
         fingerprint: fingerprint of the session and the settings that the dataset was made from.
         effects: present in the session or not, by their evidence; empty in datasets of older versions.
     """
@@ -133,6 +134,7 @@ class PackedDataset:
     uncertainty: ReflectanceUncertainty | None = None
     typical_uncertainty: Float[np.ndarray, "bands"] | None = None
     pose_method: str | None = None
+    metric: bool = True
     fingerprint: str | None = None
     effects: tuple[EffectEvidence, ...] = ()
 
@@ -211,10 +213,9 @@ def open_packed(path: Path) -> PackedDataset:
         raise InputError(f"{path}: cannot be read ({error}); process the session again.") from error
     if not dataset.frames:
         raise InputError(f"{path}: lists no frames; process the session again.")
-    for frame in dataset.frames:
-        for file in (getattr(frame, name) for name in _FRAME_FILES):
-            if not os.path.isfile(file):
-                raise InputError(f"{file}: is missing, but {path} lists it; process the session again.")
+    for file in (getattr(frame, name) for frame in dataset.frames for name in _FRAME_FILES):
+        if not os.path.isfile(file):
+            raise InputError(f"{file}: is missing, but {path} lists it; process the session again.")
     return dataset
 
 
@@ -235,7 +236,7 @@ def write_transforms(dataset: PackedDataset) -> Path:
         if dataset.uncertainty is None
         else {name: values.tolist() for name, values in asdict(dataset.uncertainty).items()},
         **{name: None if array is None else array.tolist() for name, array in arrays.items()},
-        **{name: getattr(dataset, name) for name in ("flagged_values", "pose_method", "fingerprint")},
+        **{name: getattr(dataset, name) for name in ("flagged_values", "pose_method", "metric", "fingerprint")},
         "effects": [asdict(effect) for effect in dataset.effects],
         "frames": [
             {
@@ -295,9 +296,9 @@ def _parse_transforms(root: Path, content: dict[str, Any], source: str) -> Packe
     for key in ("scene_box_m", "object_box_m"):
         if not (arrays[key][0] < arrays[key][1]).all():
             raise ValueError(f"{key} has no volume")
-    terms: dict[str, Any] = {}
-    if uncertainty is not None:
-        terms = {field.name: _numbers(uncertainty, field.name, (bands,)) for field in fields(ReflectanceUncertainty)}
+    arrays |= {key: content.get(key) for key in ("pose_method", "fingerprint")}
+    parts = () if uncertainty is None else fields(ReflectanceUncertainty)
+    terms: dict[str, Any] = {part.name: _numbers(uncertainty, part.name, (bands,)) for part in parts}
     return PackedDataset(
         root=root,
         intrinsics=intrinsics,
@@ -307,8 +308,7 @@ def _parse_transforms(root: Path, content: dict[str, Any], source: str) -> Packe
         flagged_values=int(content["flagged_values"]),
         uncertainty=ReflectanceUncertainty(**terms) if terms else None,
         frames=tuple(_parse_frame(root, frame) for frame in content["frames"]),
-        pose_method=content.get("pose_method"),
-        fingerprint=content.get("fingerprint"),
+        metric=bool(content.get("metric", True)),  # older versions do not say
         effects=tuple(_parse_effect(effect) for effect in content.get("effects", ())),
         **arrays,
     )

@@ -59,14 +59,24 @@ class KnownCamera:
     intrinsics: PinholeIntrinsics
     distortion: tuple[float, float, float, float]
     camera_to_world: Float[np.ndarray, "4 4"]
-    """Pose at the angle 0, object frame, metres."""
+    """Pose at the angle 0, object frame."""
     direction: Literal["ccw", "cw"] | None = None
     """The turntable's turn seen from above; None if the earlier session does not show it."""
+    metric: bool = True
+    """Whether lengths are metres; otherwise the earlier session had no scale."""
 
     @property
-    def distance_m(self) -> float:
-        """The camera's distance from the turntable's axis."""
-        return float(np.hypot(self.camera_to_world[0, 3], self.camera_to_world[1, 3]))
+    def distance_m(self) -> float | None:
+        """The camera's distance from the turntable's axis; None where it is not known in metres."""
+        return float(np.hypot(*self.camera_to_world[:2, 3])) if self.metric else None
+
+    def in_metres(self, distance_m: float | None) -> KnownCamera:
+        """The camera at this distance from the axis, if it is given and the earlier session had no scale."""
+        if self.metric or distance_m is None:
+            return self
+        camera_to_world = self.camera_to_world.copy()
+        camera_to_world[:3, 3] *= distance_m / np.hypot(*camera_to_world[:2, 3])
+        return replace(self, camera_to_world=camera_to_world, metric=True)
 
     def check_size(self, size_px: tuple[int, int]) -> None:
         """Refuse images of another width and height.
@@ -101,6 +111,7 @@ def poses_from_known_camera(
             be mirrored.
     """
     camera.check_size(size_px)
+    camera = camera.in_metres(info.camera_distance_m)
     direction, n = info.direction or camera.direction, len(names)
     angles_deg = required_angles_deg(info, range(n) if places is None else places)
     if direction is None:
@@ -120,8 +131,12 @@ def poses_from_known_camera(
         used=np.ones(n, bool),
         markers_per_frame=(0,) * n,
         overall_error_px=float("nan"),
-        findings=(Finding("poses-given", "amber", "Poses are as given; nothing was measured."),),
+        findings=(
+            Finding("poses-given", "amber", "Poses are as given; nothing was measured."),
+            *(() if camera.metric else (_no_scale("give camera_distance_m in session.json"),)),
+        ),
         method="angles",
+        metric=camera.metric,
     )
 
 
@@ -175,7 +190,7 @@ def poses_from_sfm(
     if hold_angles and known_angles is not None:
         held = replace(found.turntable, angles_rad=known_angles[0])
         found = adjust_tracks(held, free.tracks, free_angles=False)
-    if camera is not None and info.camera_distance_m is None:
+    if camera is not None and info.camera_distance_m is None:  # of a camera without a scale, None
         info = replace(info, camera_distance_m=camera.distance_m)
     return _posed(found, images, names, info, parameters, camera)
 
@@ -218,11 +233,10 @@ def _posed(
         grays = SessionPictures.of(images).named(GRAY)
         outline = container_outline(grays, adjusted.turntable, info.container_height_m / info.container_diameter_m)
     if scale_of(adjusted.turntable, info, outline)[0] is None:
-        sentence = (
-            "Nothing gives the scale: lengths are in units of the camera's distance from the axis; show markers and "
-            "give marker_side_m, or give camera_distance_m or the container's size in session.json."
+        advice = (
+            "show markers and give marker_side_m, or give camera_distance_m or the container's size in session.json"
         )
-        findings.append(Finding("poses-no-scale", "amber", sentence))
+        findings.append(_no_scale(advice))
     if outline is None and not lie_on_disc(adjusted.turntable.corners()).any():
         sentence = "No marker lies on the disc: the origin is at the height of the lowest marker or feature."
         findings.append(Finding("poses-origin", "amber", sentence))
@@ -245,6 +259,11 @@ def _posed(
         findings=tuple(findings),
         method="colmap" if parameters.angles else "angles",
     )
+
+
+def _no_scale(advice: str) -> Finding:
+    sentence = f"Nothing gives the scale: lengths are in units of the camera's distance from the axis; {advice}."
+    return Finding("poses-no-scale", "amber", sentence)
 
 
 def check_camera(adjusted: Adjusted, found: AdjustedTracks, camera: KnownCamera) -> list[Finding]:

@@ -139,4 +139,5 @@ def known_camera(earlier: PackedDataset) -> KnownCamera:
         distortion=(k1, k2, p1, p2),
         camera_to_world=turntable_camera_to_world(first.camera_to_world, -first.angle_deg),
         direction=None if len(forward) != 1 else "ccw" if True in forward else "cw",
+        metric=earlier.metric,
     )

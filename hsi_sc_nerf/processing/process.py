@@ -130,7 +130,8 @@ def process_session(
         return output_dir
     camera = None if config.camera is None else known_camera(open_packed(config.camera))
     info = replace(session.info, marker_side_m=config.marker_side_m or session.info.marker_side_m)
-    session, checks = _inspect(session, config, output_dir, console)
+    scale_known = config.marker_side_m is not None or (camera is not None and camera.metric)
+    session, checks = _inspect(session, config, scale_known, output_dir, console)
     _remove_transforms(output_dir)
     checks.write()
 
@@ -189,6 +190,7 @@ def process_session(
         uncertainty=calibration.uncertainty,
         typical_uncertainty=typical,
         pose_method=poses.method,
+        metric=poses.metric,
         fingerprint=fingerprint,
     )
     with console.status("measuring the effects in the session"):
@@ -206,11 +208,10 @@ def process_session(
 
 
 def _inspect(
-    session: Session, config: ProcessConfig, output_dir: Path, console: Console
+    session: Session, config: ProcessConfig, scale_known: bool, output_dir: Path, console: Console
 ) -> tuple[Session, SessionChecks]:
     """The session upright, and what its inspection found, whose pictures of all frames are not kept."""
     with console.status("checking the session"):
-        scale_known = config.marker_side_m is not None or config.camera is not None
         inspection = inspect_session(
             session, config.poses, scale_known, config.calibration.white_source, config.skip_damaged
         )
@@ -332,8 +333,9 @@ def _boxes(
 ) -> tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "2 3"]]:
     """The boxes of the object and of everything that turns; print what is assumed for them."""
     object_box_m = object_box(hull, None if container is None else container.height_m)
-    size_mm = " x ".join(f"{1000.0 * side:.0f}" for side in np.diff(object_box_m, axis=0)[0])
-    console.print(f"Object: inside a box of {size_mm} mm.")
+    factor, unit = (1000.0, "mm") if poses.metric else (100.0, "% of the camera's distance")
+    size = " x ".join(f"{factor * side:.0f}" for side in np.diff(object_box_m, axis=0)[0])
+    console.print(f"Object: inside a box of {size} {unit}.")
     diameter_m = session.info.container_diameter_m if poses.metric else None
     if assumption := assumed_disc(bool(poses.marker_corners_m), diameter_m):
         console.print(f"Scene: {assumption}.", highlight=False)

@@ -77,7 +77,7 @@ def edit(root: Path, change) -> None:
 def test_round_trip(dataset, known):
     if not known:
         unknown = dict.fromkeys(("container", "fwhm_nm", "uncertainty", "typical_uncertainty", "fingerprint"))
-        dataset = replace(dataset, bad_bands_nm=np.zeros(0), **unknown)
+        dataset = replace(dataset, bad_bands_nm=np.zeros(0), metric=False, **unknown)
     write_transforms(dataset)
     for path in (dataset.root, dataset.root / "transforms.json"):
         opened = open_packed(path)
@@ -94,6 +94,12 @@ def test_round_trip(dataset, known):
         kept = ("capture", "angle_deg", "reprojection_error_px", "flags_path", "image_path")
         for mine, theirs in zip(opened.frames, dataset.frames, strict=True):
             assert [getattr(mine, name) for name in kept] == [getattr(theirs, name) for name in kept]
+
+
+def test_datasets_of_older_versions_are_metric(dataset):
+    write_transforms(replace(dataset, metric=False))
+    edit(dataset.root, lambda content: content.pop("metric"))
+    assert open_packed(dataset.root).metric
 
 
 def test_a_frames_files(dataset):

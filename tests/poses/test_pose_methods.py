@@ -145,6 +145,17 @@ def test_a_scale_may_start_again_and_count_down(given, turned, told, before, sig
     assert [finding.name for finding in check_poses(poses, info)] == ["poses-given"]
 
 
+@pytest.mark.parametrize(("distance_m", "names"), [(None, ["poses-given", "poses-no-scale"]), (0.4, ["poses-given"])])
+def test_an_earlier_camera_without_a_scale_gives_none(distance_m, names):
+    unit = CAMERA.camera_to_world.copy()
+    unit[:3, 3] /= 0.4
+    camera, info = replace(CAMERA, camera_to_world=unit, metric=False), replace(STEPS, camera_distance_m=distance_m)
+    poses = find_poses(BLANK, list("abcd"), info, "angles", camera=camera)
+    assert (poses.metric, [finding.name for finding in poses.findings]) == (distance_m is not None, names)
+    np.testing.assert_allclose(poses.camera_to_world[0], CAMERA.camera_to_world if distance_m else unit, atol=1e-12)
+    assert (camera.distance_m, CAMERA.distance_m) == (None, pytest.approx(0.4))
+
+
 def test_nominal_steps_count_captures_that_are_left_out():
     places = (0, 1, 3, 4)
     poses = find_poses(

@@ -3,6 +3,7 @@ import logging
 import re
 import sys
 import weakref
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -33,6 +34,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.inspection import inspect
 from hsi_sc_nerf.packed.cube import REFLECTANCE_SCALE
 from hsi_sc_nerf.packed.dataset import Container, open_packed
+from hsi_sc_nerf.poses.pose_methods import find_poses
 from hsi_sc_nerf.processing import process
 from hsi_sc_nerf.processing.frames import pack_frames
 from hsi_sc_nerf.processing.masks import MaskConfig, foreground_masks
@@ -230,10 +232,26 @@ def test_a_changed_file_that_the_session_or_a_setting_names_is_noticed(session, 
 )
 def test_an_earlier_session_tells_how_the_table_turns(angles_deg, direction):
     frames = [SimpleNamespace(angle_deg=angle, camera_to_world=true_pose(angle)) for angle in angles_deg]
-    earlier = SimpleNamespace(frames=frames, intrinsics=INTRINSICS, distortion=np.zeros(4))
-    camera = known_camera(earlier)
-    assert camera.direction == direction
+    for metric in (True, False):
+        earlier = SimpleNamespace(frames=frames, intrinsics=INTRINSICS, distortion=np.zeros(4), metric=metric)
+        camera = known_camera(earlier)
+        assert (camera.direction, camera.metric) == (direction, metric)
     np.testing.assert_allclose(camera.camera_to_world, true_pose(0.0), atol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_camera_of_a_session_without_a_scale_gives_none(tmp_path):
+    info = {"object": "ball", "nominal_step_deg": 90, "direction": "ccw"}
+    session = write_session(tmp_path / "session", ANGLES_DEG, info=info)
+
+    def unscaled(*given, **options):
+        return replace(true_poses(*given, **options), metric=False)
+
+    earlier = run(session, tmp_path / "earlier", ProcessConfig(poses="colmap"), poses=unscaled)
+    output = run(session, tmp_path / "data", ProcessConfig(poses="angles", camera=earlier), poses=find_poses)
+    assert not open_packed(output).metric
+    findings = json.loads((output / "report" / "inspection.json").read_text())["findings"]
+    assert [f["level"] for f in findings if f["name"] in ("scale", "poses-no-scale")] == ["amber", "amber"]
 
 
 @pytest.mark.slow
