@@ -102,7 +102,8 @@ def container_outline(
     looks = turntable.camera_rotation[2]
     depth = float(looks @ [-turntable.distance, 0.0, foot])
     edge = _EDGE_PX * depth / turntable.focal_px
-    errors = np.hypot(scatter / np.sqrt(len(found)), [edge, edge / abs(turntable.camera_rotation[1, 2])])
+    in_image = np.hypot(*turntable.camera_rotation[:2, 2])  # length of the axis' unit vector
+    errors = np.hypot(scatter / np.sqrt(len(found)), [edge, edge / in_image])
     # A higher container is nearer to a camera that looks down, and appears wider.
     nearer = looks[2] / depth * errors[1]
     return ContainerOutline(radius, float(np.hypot(errors[0] / radius, nearer)), foot, float(errors[1]))

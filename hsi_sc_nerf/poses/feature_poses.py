@@ -36,7 +36,7 @@ from hsi_sc_nerf.poses.track_adjustment import (
     with_lost_frames,
 )
 from hsi_sc_nerf.poses.turntable import Turntable
-from hsi_sc_nerf.poses.turntable_from_poses import turntable_from_poses
+from hsi_sc_nerf.poses.turntable_from_poses import looks_up_deg, turntable_from_poses, upright
 
 _FOCAL_SIGMA = 0.002
 """Standard deviation of an earlier session's focal length, as a fraction."""
@@ -45,6 +45,8 @@ _LEAST_ANGLE_SIGMA_RAD = 1e-3
 _SIGMAS, _LEAST_TILT_DEG, _LEAST_ZOOM = 3.0, 0.3, 0.02
 """The features contradict an earlier camera from this many standard deviations, and this tilt of the axis or this
 fraction of the focal length."""
+_LEAST_LOOKS_UP_DEG = 3.0
+"""A camera at the object's height seems to look up by less than this."""
 MOST_CONTRADICTING = 1 / 3
 """Largest fraction of COLMAP's poses that may contradict one turntable: with more, the right ones are not known."""
 
@@ -180,7 +182,7 @@ def poses_from_sfm(
             "turntable; take images of more pixels, show markers, or give the angles"
         )
     found = adjust_either_depth(start, free.tracks)
-    found = adjust_tracks(with_lost_frames(found.turntable, free.tracks), free.tracks)
+    found = adjust_tracks(with_lost_frames(upright(found.turntable), free.tracks), free.tracks)
     known_angles = None if angles_deg is None else prior_of_angles(found.turntable, np.deg2rad(angles_deg))
     parameters = FreeParameters(
         angles=not hold_angles,
@@ -240,6 +242,12 @@ def _posed(
     if outline is None and not lie_on_disc(adjusted.turntable.corners()).any():
         sentence = "No marker lies on the disc: the origin is at the height of the lowest marker or feature."
         findings.append(Finding("poses-origin", "amber", sentence))
+    if (up_deg := looks_up_deg(adjusted.turntable)) > _LEAST_LOOKS_UP_DEG:
+        sentence = (
+            f"The camera seems to look up at the object by {up_deg:.0f} degrees; if the pictures are upside down, "
+            "set image_rotation_deg."
+        )
+        findings.append(Finding("poses-upright", "amber", sentence, {"looks_up_deg": up_deg}))
     return in_object_frame(
         adjusted,
         markers,

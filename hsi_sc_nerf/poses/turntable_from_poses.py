@@ -38,7 +38,7 @@ def turntable_from_poses(
     """The axis, the camera before it and one angle per frame that fit free poses best.
 
     The axis comes from the frames that most pairs of frames agree with; single wrong poses do no harm. Poses alone
-    do not determine which end of an axis is up: it is taken up in the image, to within 90 degrees.
+    do not determine which end of an axis is up: it is taken up in the image, to within 90 degrees (`upright`).
 
     Args:
         world_to_camera: OpenCV axes, any scale; nan where a frame has no pose.
@@ -99,6 +99,31 @@ def turntable_from_poses(
         points_3d=(points_3d - origin) @ to_turntable.T / distance,
     )
     return turntable, contradicts
+
+
+def upright(turntable: Turntable) -> Turntable:
+    """The turntable, turned over if its axis lies in the image and the camera would look up at the points.
+
+    Along the image's horizontal, up in the image says nothing; cameras of turntables look down.
+
+    Args:
+        turntable: without markers and motions.
+    """
+    right, down, _ = np.abs(turntable.camera_rotation[:, 2])
+    if right <= down or looks_up_deg(turntable) <= 0.0:
+        return turntable
+    turned_over = np.diag([1.0, -1.0, -1.0])
+    return replace(
+        turntable,
+        camera_rotation=turntable.camera_rotation @ turned_over,
+        angles_rad=-turntable.angles_rad,
+        points_3d=turntable.points_3d @ turned_over,
+    )
+
+
+def looks_up_deg(turntable: Turntable) -> float:
+    """How far the middle of the points is above the camera's horizon."""
+    return float(np.rad2deg(np.arctan2(np.median(turntable.points_3d[:, 2]), turntable.distance)))
 
 
 def reversed_in_depth(turntable: Turntable) -> Turntable:

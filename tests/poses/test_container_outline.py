@@ -1,6 +1,6 @@
 """The container's radius and foot in drawn frames."""
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import cv2
 import numpy as np
@@ -53,6 +53,18 @@ def test_radius_and_foot_are_those_of_the_drawn_container(turntable, shift_m, en
     assert found.radius_sigma < 0.015
     assert found.foot == pytest.approx(-camera_m, abs=2.0 * found.foot_sigma)
     assert found.foot_sigma < 0.002
+
+
+def test_pictures_that_lie_on_their_side_show_the_same_container(turntable):
+    scene, machine = turntable
+    points_3d = machine.points_3d.copy()
+    points_3d[:, 2] += HEIGHT_M - scene.first_camera_to_world[2, 3] - np.percentile(points_3d[:, 2], 1.0)
+    machine, images = replace(machine, points_3d=points_3d), drawn(scene, 0.0, 60.0)
+    quarter = Rotation.from_euler("z", -90.0, True).as_matrix()
+    aside = replace(machine, camera_rotation=quarter @ machine.camera_rotation)
+    upright = container_outline(images, machine, HEIGHT_M / RADIUS_M / 2.0)
+    found = container_outline([np.rot90(image) for image in images], aside, HEIGHT_M / RADIUS_M / 2.0)
+    np.testing.assert_allclose(astuple(found), astuple(upright), rtol=1e-3)
 
 
 def test_what_is_hardly_seen_is_not_measured(turntable):

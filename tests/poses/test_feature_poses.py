@@ -8,9 +8,11 @@ from exact_turntable import marker_observations, marker_turntable, point_tracks,
 from scipy.spatial.transform import Rotation
 from turntable_scene import MarkerScene
 
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
+from hsi_sc_nerf.capture.session_info import SessionInfo
+from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, PinholeIntrinsics
 from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters
-from hsi_sc_nerf.poses.feature_poses import KnownCamera, check_camera, prior_of_angles
+from hsi_sc_nerf.poses.feature_poses import KnownCamera, check_camera, poses_from_sfm, prior_of_angles
+from hsi_sc_nerf.poses.structure_from_motion import FreePoses
 from hsi_sc_nerf.poses.track_adjustment import adjust_together, adjust_tracks
 
 
@@ -54,6 +56,30 @@ def test_an_earlier_camera_holds_and_is_contradicted_where_it_zoomed(session):
     leaning = known_camera(scene, zoom)
     leaning.camera_to_world[:3, :3] = leaning.camera_to_world[:3, :3] @ Rotation.from_euler("z", 0.3).as_matrix()
     assert [finding.level for finding in check_camera(adjusted, found, leaning)] == ["red"]
+
+
+def by_features(true, tracks, roll_deg=0.0, **known):
+    """Poses from free poses and tracks that COLMAP would find of a turntable, in rolled pictures."""
+    roll = Rotation.from_euler("z", roll_deg, True).as_matrix()
+    poses = np.linalg.inv(true.camera_to_world() @ OPENCV_TO_OPENGL)
+    poses[:, :3] = roll @ poses[:, :3]
+    pixels = (tracks.pixels - true.centre_px) @ roll[:2, :2].T + true.centre_px
+    free = FreePoses(poses, true.focal_px, true.centre_px, true.points_3d, replace(tracks, pixels=pixels))
+    blank, names = [np.zeros((256, 256), np.uint8)] * len(poses), [f"f{i}" for i in range(len(poses))]
+    return poses_from_sfm(blank, names, SessionInfo(marker_dictionary="DICT_4X4_50"), free=free, **known)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("roll_deg", "upside_down"), [(120.0, False), (180.0, True)])
+def test_the_object_stands_on_its_feet_unless_pictures_are_upside_down(session, roll_deg, upside_down):
+    _, true, _ = session
+    true = points_alone(true)
+    poses = by_features(true, point_tracks(true, noise_px=0.05), roll_deg)
+    assert (poses.camera_to_world[0, 2, 3] > 0.0) != upside_down
+    np.testing.assert_allclose(
+        poses.angles_deg, (-1.0 if upside_down else 1.0) * np.rad2deg(true.angles_rad), atol=0.5
+    )
+    assert ("poses-upright" in {finding.name for finding in poses.findings}) == upside_down
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

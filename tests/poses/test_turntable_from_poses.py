@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.poses.turntable import Tracks
-from hsi_sc_nerf.poses.turntable_from_poses import reversed_in_depth, turntable_from_poses
+from hsi_sc_nerf.poses.turntable_from_poses import looks_up_deg, reversed_in_depth, turntable_from_poses, upright
 
 CAMERA = 500.0, (128.0, 128.0)
 ELEVATION_DEG, ROLL_DEG, DISTANCE = 25.0, 4.0, 0.42
@@ -111,6 +111,22 @@ def test_two_poses_are_too_few():
     poses[1] = np.nan
     with pytest.raises(InputError, match="cannot fix"):
         turntable_from_poses(poses, np.zeros((0, 3)), *CAMERA)
+
+
+@pytest.mark.parametrize("roll_deg", [0.0, 60.0, 89.5, 90.5, 120.0, -90.0, 180.0])
+def test_in_pictures_that_lie_on_their_side_the_camera_looks_down(roll_deg):
+    poses, _, points = free_poses(np.arange(0, 360, 18.0))
+    roll = np.eye(4)
+    roll[:3, :3] = Rotation.from_euler("z", roll_deg - ROLL_DEG, True).as_matrix()
+    points[:, 2] -= 0.2
+    in_camera = 3.0 * (points - [DISTANCE, 0.0, 0.0]) @ machine().T
+    in_world = (in_camera - poses[0, :3, 3]) @ poses[0, :3, :3]
+    found = upright(turntable_from_poses(roll @ poses, in_world, *CAMERA)[0])
+    upside_down = roll_deg == 180.0
+    assert (looks_up_deg(found) > 10.0) == upside_down
+    sign = -1.0 if upside_down else 1.0
+    np.testing.assert_allclose(found.points_3d, points * [1.0, sign, sign] / DISTANCE, atol=1e-8)
+    np.testing.assert_allclose(np.rad2deg(found.angles_rad), sign * np.arange(0, 360, 18.0), atol=1e-6)
 
 
 def test_a_camera_far_away_sees_the_same_of_the_turntable_reversed_in_depth():
