@@ -266,6 +266,7 @@ def _posed(
         loop_closure_deg=found.loop_closure_deg(),
         findings=tuple(findings),
         method="colmap" if parameters.angles else "angles",
+        camera_given=camera is not None,
     )
 
 

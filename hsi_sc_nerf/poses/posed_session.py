@@ -24,7 +24,7 @@ from hsi_sc_nerf.poses.object_frame import (
     to_object_frame,
 )
 from hsi_sc_nerf.poses.residuals import PointResiduals
-from hsi_sc_nerf.poses.result import Scale, ScaleSource, TurntablePoses, Uncertainty
+from hsi_sc_nerf.poses.result import LARGEST_PLAQUE, Scale, ScaleSource, TurntablePoses, Uncertainty
 from hsi_sc_nerf.poses.turntable import MarkerObservations, Turntable, project, projection_jacobian
 
 _FIELD_PX = 0.007
@@ -92,6 +92,9 @@ def _scale(
     if markers is not None and len(ids) > 1:
         sides, sigmas = apparent_sides(adjusted.turntable, markers)
         variance += float(np.var(sides, ddof=1)) / len(ids)
+    if source == "container":
+        # Root mean square of what is evenly spread from none to the largest.
+        variance += LARGEST_PLAQUE**2 / 3.0
     return Scale(
         source=source,
         marker_side_m=turntable.side if ids else None,

@@ -14,14 +14,12 @@ from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.findings import Finding, Level, names_in_short
 from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure
 from hsi_sc_nerf.poses.known_angles import check_angles, step_deviation_deg
-from hsi_sc_nerf.poses.result import TurntablePoses, is_full_turn
+from hsi_sc_nerf.poses.result import LARGEST_PLAQUE, TurntablePoses, is_full_turn
 
 # The paper's target for the reprojection error (section "Pose Estimation").
 REPROJECTION_TARGET_PX = 1.0
 # Contradictions count from this many standard deviations.
 _SIGMAS = 3.0
-# A plaque that carries a marker stands off the container's wall: the container is found wider by up to this.
-_LARGEST_PLAQUE_PERCENT = 2.5
 # A distance measured by tape, from a lens whose centre is inside, is good to this.
 _DISTANCE_PERCENT = 5.0
 # A marker's side is odd if it differs by this and by this many standard deviations.
@@ -69,15 +67,22 @@ def check_poses(poses: TurntablePoses, info: SessionInfo, places: Sequence[int] 
 def _check_uncertainty(poses: TurntablePoses) -> list[Finding]:
     if poses.uncertainty is None:
         return []
-    scale = 0.0 if poses.scale is None else poses.scale.uncertainty
-    known = np.array([poses.uncertainty.rotation_deg, 1e3 * poses.uncertainty.position_m, 100.0 * scale])
+    percent = None if poses.scale is None else 100.0 * poses.scale.uncertainty
+    known = np.array([poses.uncertainty.rotation_deg, 1e3 * poses.uncertainty.position_m, percent or 0.0])
     level: Level = "red" if (known > _UNUSABLE).any() else "amber" if (known > _GOAL).any() else "green"
     place = f"{known[1]:.2g} mm" if poses.metric else f"{0.1 * known[1]:.2g} % of the camera's distance"
-    sentence = f"The poses are known to {known[0]:.2g} degrees and {place}, the scale to {known[2]:.2g} %"
-    show = "larger markers" if poses.method == "markers" else "markers on the turntable"
-    advice = f"; show {show}, or give --camera, an earlier dataset of the same camera."
-    values = {"rotation_deg": known[0], "position_mm": known[1], "scale_percent": known[2]}
-    return [Finding("poses-uncertain", level, sentence + ("." if level == "green" else advice), values)]
+    scale = "the scale is not known" if percent is None else f"the scale to {percent:.2g} %"
+    advice = []
+    if poses.scale is not None and poses.scale.source == "container":
+        advice.append("give marker_side_m, for markers may stand off the container")
+    if (known[:2] > _GOAL[:2]).any() or not advice:
+        advice.append("show " + ("larger or more markers" if poses.dictionary else "markers on the turntable"))
+        if poses.method != "markers" and not poses.camera_given:
+            advice.append("give --camera, an earlier dataset of the same camera")
+    sentence = f"The poses are known to {known[0]:.2g} degrees and {place}, {scale}"
+    sentence += "." if level == "green" else f"; {', or '.join(advice)}."
+    values = {"rotation_deg": known[0], "position_mm": known[1], "scale_percent": percent}
+    return [Finding("poses-uncertain", level, sentence, values)]
 
 
 def _check_scale(poses: TurntablePoses) -> list[Finding]:
@@ -87,7 +92,7 @@ def _check_scale(poses: TurntablePoses) -> list[Finding]:
         return found
     percent = scale.disagreement_percent
     if percent is not None and scale.source != "container":
-        excess = abs(percent - np.clip(percent, 0.0, _LARGEST_PLAQUE_PERCENT))
+        excess = abs(percent - np.clip(percent, 0.0, 100.0 * LARGEST_PLAQUE))
         level: Level = "red" if excess > max(_SIGMAS * 100.0 * scale.uncertainty, 1.0) else "green"
         sentence = (
             f"The container is {abs(percent):.1f} % {'wider' if percent > 0.0 else 'narrower'} by the scale of the "

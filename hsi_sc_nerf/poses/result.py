@@ -27,6 +27,8 @@ class RejectedMarker:
     why: str
 
 
+LARGEST_PLAQUE = 0.025
+"""Markers' plaques stand off the container's wall: the container is found wider by up to this fraction."""
 ScaleSource: TypeAlias = Literal["markers", "container", "outline", "distance"]
 
 
@@ -39,7 +41,8 @@ class Scale:
     marker_side_m: float | None
     """Side of a marker's black square, given or measured; None without markers."""
     uncertainty: float
-    """Standard deviation of the scale, as a fraction: by the fit of the corners, and by the markers' own spread."""
+    """Standard deviation of the scale, as a fraction: by the fit of the corners, by the markers' own spread, and by
+    ``LARGEST_PLAQUE`` where markers on the container give the scale."""
     marker_sides: dict[int, float]
     """Each marker's apparent side over the mean of all."""
     marker_side_sigmas: dict[int, float]
@@ -126,6 +129,8 @@ class TurntablePoses:
     evidence: Mapping[str, float] = field(default_factory=dict)
     """Evidence for lens_distortion and for wobble, where the method tests for them: -log10 of the p-value."""
     outliers: tuple[RejectedMarker, ...] = ()
+    camera_given: bool = False
+    """Whether the camera of an earlier session helped."""
     scale: Scale | None = None
     """Where the size comes from; None where it is not known."""
     uncertainty: Uncertainty | None = None

@@ -8,8 +8,15 @@ from exact_turntable import marker_observations, marker_turntable, point_tracks,
 from scipy.spatial.transform import Rotation
 from turntable_scene import MarkerScene
 
+from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters, Problem
-from hsi_sc_nerf.poses.posed_session import _landmark_gradients, pose_uncertainty, smooth_fields, with_hidden_errors
+from hsi_sc_nerf.poses.posed_session import (
+    _landmark_gradients,
+    in_object_frame,
+    pose_uncertainty,
+    smooth_fields,
+    with_hidden_errors,
+)
 from hsi_sc_nerf.poses.residuals import MarkerResiduals, PointResiduals
 from hsi_sc_nerf.poses.track_adjustment import adjust_together, adjust_tracks
 
@@ -53,6 +60,18 @@ def test_markers_that_are_shifted_together_are_covered():
     # Without the hidden errors too little is stated.
     bare = scores(Adjusted(problem.minimise(true), problem), true)
     assert np.abs(bare).max() > 2.0 * found[-1].max()
+
+
+def test_a_scale_by_a_container_whose_markers_may_stand_off_is_stated_as_uncertain():
+    true = marker_turntable(MarkerScene(size_px=256, frames=12))
+    seen = marker_observations(true)
+    adjusted, names = Adjusted(true, Problem(MarkerResiduals(true, seen, 3.0))), [f"f{i}" for i in range(12)]
+    specific = {"reprojection_error_px": np.zeros(12), "overall_error_px": 0.0, "markers_per_frame": (3,) * 12}
+    for known, source, least in (("marker_side_m", "markers", 0.0), ("container_diameter_m", "container", 0.014)):
+        info = SessionInfo(container_height_m=0.07, **{known: 0.03})
+        scale = in_object_frame(adjusted, seen, names, (256, 256), info, **specific).scale
+        assert scale.source == source
+        assert least <= scale.uncertainty < least + 0.005
 
 
 @pytest.mark.parametrize("markers", [False, True])

@@ -8,7 +8,7 @@ from capture_factory import true_poses
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.poses.report import check_poses, pose_report
-from hsi_sc_nerf.poses.result import Scale
+from hsi_sc_nerf.poses.result import Scale, Uncertainty
 
 GOOD = true_poses([None] * 4, list("abcd"))
 SCALE = Scale("markers", 0.03, 0.002, {}, {}, 0.09, 0.0905)
@@ -18,6 +18,28 @@ STEPS = SessionInfo(nominal_step_deg=90.0, direction="ccw")
 
 def levels(poses, info=STEPS):
     return {finding.name: finding.level for finding in check_poses(poses, info)}
+
+
+UNSURE = replace(GOOD, uncertainty=Uncertainty(0.01, 0.01, 0.01, np.full(4, 0.01), 0.5, 0.0004))
+FEATURES = {"method": "colmap", "dictionary": None, "metric": False}
+
+
+@pytest.mark.parametrize(
+    ("poses", "advice", "percent"),
+    [
+        (replace(UNSURE, scale=SCALE), ["markers"], 0.2),
+        (replace(UNSURE, scale=replace(SCALE, source="container")), ["marker_side_m", "markers"], 0.2),
+        (replace(UNSURE, **FEATURES), ["markers", "--camera"], None),
+        (replace(UNSURE, **FEATURES, camera_given=True), ["markers"], None),
+    ],
+)
+def test_uncertain_poses_come_with_advice_that_can_help(poses, advice, percent):
+    (finding,) = [finding for finding in check_poses(poses, SessionInfo()) if finding.name == "poses-uncertain"]
+    assert finding.level == "amber"
+    assert finding.values["scale_percent"] == percent
+    told = finding.sentence.split("; ", 1)[1]
+    assert [word for word in ("marker_side_m", "markers", "--camera") if word in told] == advice
+    assert ("not known" in finding.sentence) == (percent is None)
 
 
 def test_places_of_captures_that_are_left_out_count():
