@@ -6,6 +6,7 @@ and ``turntable_from_poses`` fits one turntable to them.
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,6 +35,8 @@ _FEWEST_NEIGHBOURS = 3
 # from the distance; the bundle adjustment of the turntable determines it.
 _FOCAL_FACTOR = 1.5
 _SEED = 0
+# Features (at most 8192, of 152 bytes each) and matches of a frame in COLMAP's database.
+_DATABASE_BYTES = 1_500_000
 # Least contrast of a SIFT feature: less than COLMAP's 0.0067, for skin is smooth.
 _PEAK_THRESHOLD = 0.004
 # Standard deviation of the Gaussian that lowers the images' noise, pixels.
@@ -85,7 +88,8 @@ def structure_from_motion(
         focal_px: focal length of the camera, where it is known; mapping holds it.
 
     Raises:
-        InputError: nothing moves, or the object has too little texture to pose three frames.
+        InputError: nothing moves, the object has too little texture to pose three frames, or COLMAP cannot write
+            its temporary files.
         ValueError: images of different sizes, or not one name per image.
     """
     require_frames(images, names)
@@ -98,20 +102,47 @@ def structure_from_motion(
     # The images are stretched to the contrast of the moving pixels.
     low, high = np.percentile(np.stack(images)[:, moving], _STRETCH_PERCENTILES)
     table = np.rint(np.clip((np.arange(256) - low) / max(high - low, 1.0), 0.0, 1.0) * 255.0).astype(np.uint8)
-    with tempfile.TemporaryDirectory(prefix="hsi-sc-nerf-colmap-") as name:
-        folder = Path(name)
-        (folder / "images").mkdir()
-        for i, image in enumerate(images):
-            cv2.imwrite(str(folder / "images" / _file_name(i)), table[image])
-        cv2.imwrite(str(folder / "mask.png"), moving.astype(np.uint8) * 255)
-        _match(folder, len(images), images[0].shape, focal_px)
-        reconstruction = _map(folder)
-        if reconstruction is None:
-            raise InputError(
-                f"the frames {names[0]} ... {names[-1]} show too little texture to find poses from features; take "
-                "markers or smaller steps"
-            )
-        return _free_poses(reconstruction, len(names))
+    place = "folder of temporary files"
+    try:
+        place = tempfile.gettempdir()
+        require_space(Path(place), len(images) * (_DATABASE_BYTES + images[0].size))
+        with tempfile.TemporaryDirectory(prefix="hsi-sc-nerf-colmap-") as name:
+            folder = Path(name)
+            (folder / "images").mkdir()
+            for i, image in enumerate(images):
+                _write(folder / "images" / _file_name(i), table[image])
+            _write(folder / "mask.png", moving.astype(np.uint8) * 255)
+            _match(folder, len(images), images[0].shape, focal_px)
+            reconstruction = _map(folder)
+    except (OSError, RuntimeError) as error:  # pycolmap raises the latter
+        raise InputError(
+            f"{place}: COLMAP cannot write its files ({error}); free space there, or set TMPDIR to another disk"
+        ) from error
+    if reconstruction is None:
+        raise InputError(
+            f"the frames {names[0]} ... {names[-1]} show too little texture to find poses from features; take "
+            "markers or smaller steps"
+        )
+    return _free_poses(reconstruction, len(names))
+
+
+def require_space(folder: Path, needed: int) -> None:
+    """Refuse a disk that is too full before COLMAP starts: it would end the process.
+
+    Args:
+        needed: bytes.
+
+    Raises:
+        OSError: there is less space, or no folder.
+    """
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        raise OSError(f"{free / 1e6:.0f} MB are free, {needed / 1e6:.0f} MB may be needed")
+
+
+def _write(path: Path, image: UInt8[np.ndarray, "h w"]) -> None:
+    if not cv2.imwrite(str(path), image):
+        raise OSError(f"{path.name} could not be written")
 
 
 def moving_pixels(images: Sequence[UInt8[np.ndarray, "h w"]]) -> Bool[np.ndarray, "h w"]:
@@ -241,8 +272,11 @@ def _free_poses(reconstruction: pycolmap.Reconstruction, frames: int) -> FreePos
 
 def _lamp_factor(image: Float[np.ndarray, "h w"], middle: Float[np.ndarray, "h w"]) -> float:
     """Brightness of the image over that of the median image: the median over the pixels that are not dark."""
-    bright = middle >= np.median(middle)
-    return float(np.median(image[bright] / np.maximum(middle[bright], 1.0)))
+    lit = middle >= 1.0  # in a black chamber few
+    if not lit.any():
+        return 1.0
+    bright = lit & (middle >= np.median(middle[lit]))
+    return float(np.median(image[bright] / middle[bright]))
 
 
 def _noise_spread(mean: Float[np.ndarray, "h w"], spread: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:

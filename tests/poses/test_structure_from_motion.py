@@ -1,5 +1,6 @@
 """Poses without markers on small pictures of a patterned ball before a patterned wall, with known truth."""
 
+import sys
 import tempfile
 from functools import lru_cache
 
@@ -10,7 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, turntable_camera_to_world
-from hsi_sc_nerf.poses.structure_from_motion import moving_pixels, neighbour_pairs, structure_from_motion
+from hsi_sc_nerf.poses.structure_from_motion import (
+    moving_pixels,
+    neighbour_pairs,
+    require_space,
+    structure_from_motion,
+)
 from hsi_sc_nerf.poses.track_adjustment import adjust_tracks
 from hsi_sc_nerf.poses.turntable_from_poses import turntable_from_poses
 
@@ -81,6 +87,44 @@ def test_what_moves_is_told_from_a_patterned_wall(noise, drift):
     assert moving[covered == 1].mean() > 0.95
     far = cv2.dilate(covered, np.ones((13, 13))) == 0
     assert moving[far].mean() < 0.003
+
+
+@pytest.mark.slow
+def test_what_moves_is_told_from_a_black_wall():
+    images, _, covered = session()
+    stand = np.arange(SIZE_PX)[:, None] > 0.93 * SIZE_PX  # which stands still and gives the noise
+    images = [np.where((covered > 0) | stand, image, 0).astype(np.uint8) for image in images]
+    assert np.median(images) == 0.0
+    moving = moving_pixels(images)
+    assert moving[covered == 1].mean() > 0.95
+    assert moving[cv2.dilate(covered, np.ones((13, 13))) == 0].mean() < 0.003
+    assert not moving_pixels([np.zeros_like(images[0])] * 3).any()
+
+
+@pytest.mark.slow
+def test_a_disk_without_space_is_named(tmp_path, monkeypatch):
+    images, _, _ = session()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
+    with pytest.raises(InputError, match=r"none: .*TMPDIR"):
+        structure_from_motion(images, names())
+    with pytest.raises(OSError, match="MB are free"):
+        require_space(tmp_path, 10**18)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit of the size of files")
+def test_files_that_cannot_be_written_are_no_lack_of_texture(tmp_path, monkeypatch):
+    import resource
+
+    images, _, _ = session()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))
+    try:
+        with pytest.raises(InputError, match="TMPDIR"):
+            structure_from_motion(images, names())
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.mark.slow
