@@ -151,7 +151,9 @@ def _gradients(
     do not.
     """
     in_camera = (points - [turntable.distance, 0.0, 0.0]) @ turntable.camera_rotation.T
-    pixels = turntable.focal_px * in_camera[..., :2] / in_camera[..., 2:] + turntable.centre_px
+    normalised = in_camera[..., :2] / in_camera[..., 2:]
+    r2, (k1, k2) = (normalised**2).sum(axis=-1, keepdims=True), turntable.radial
+    pixels = turntable.focal_px * (1.0 + r2 * (k1 + k2 * r2)) * normalised + turntable.centre_px
     x, y = (pixels[..., k].astype(np.float32).reshape(-1, points.shape[2]) - np.float32(0.5) for k in (0, 1))
     shown = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
     step_px = np.linalg.norm(np.diff(pixels, axis=2), axis=-1).mean()

@@ -135,7 +135,7 @@ def poses_from_known_camera(
         overall_error_px=float("nan"),
         findings=(
             Finding("poses-given", "amber", "Poses are as given; nothing was measured."),
-            *(() if camera.metric else (_no_scale("give camera_distance_m in session.json"),)),
+            *(() if camera.metric else (_no_scale("give camera_distance_m"),)),
         ),
         method="angles",
         metric=camera.metric,
@@ -158,7 +158,7 @@ def poses_from_sfm(
 
     Args:
         info: what gives the scale, the markers' dictionary, and the angles.
-        camera: camera of an earlier session, whose focal length and distance from the axis still hold.
+        camera: camera of an earlier session, whose lens and distance from the axis still hold.
         hold_angles: take the known angles for exact; their direction is that of the images.
         places: each frame's place in the turn (`Session.places`); one after the other if not given.
         free: what ``structure_from_motion`` finds with the camera's focal length, where it is known already.
@@ -181,6 +181,8 @@ def poses_from_sfm(
             f"{int(contradicts.sum())} of the {int(free.used.sum())} poses that COLMAP found contradict one "
             "turntable; take images of more pixels, show markers, or give the angles"
         )
+    if camera is not None:
+        start = replace(start, radial=camera.distortion[:2])
     found = adjust_either_depth(start, free.tracks)
     found = adjust_tracks(with_lost_frames(upright(found.turntable), free.tracks), free.tracks)
     known_angles = None if angles_deg is None else prior_of_angles(found.turntable, np.deg2rad(angles_deg))
@@ -230,15 +232,15 @@ def _posed(
         findings = check_camera(adjusted, found, camera)
     errors_px, overall_px = turntable.frame_errors_px(found.tracks, n)
     height, width = images[0].shape
-    outline = None
-    if markers is None and info.container_diameter_m is not None and info.container_height_m is not None:
+    outline, diameter_m, height_m = None, info.container_diameter_m, info.container_height_m
+    scale_is_poor = scale_of(adjusted.turntable, info)[0] in (None, "distance")
+    if scale_is_poor and diameter_m is not None and height_m is not None:
         grays = SessionPictures.of(images).named(GRAY)
-        outline = container_outline(grays, adjusted.turntable, info.container_height_m / info.container_diameter_m)
+        outline = container_outline(grays, adjusted.turntable, height_m / diameter_m)
     if scale_of(adjusted.turntable, info, outline)[0] is None:
-        advice = (
-            "show markers and give marker_side_m, or give camera_distance_m or the container's size in session.json"
-        )
-        findings.append(_no_scale(advice))
+        show = "show markers and give" if markers is None else "give"
+        size = "" if diameter_m is not None else " or the container's size"
+        findings.append(_no_scale(f"{show} marker_side_m, or give camera_distance_m{size}"))
     if outline is None and not lie_on_disc(adjusted.turntable.corners()).any():
         sentence = "No marker lies on the disc: the origin is at the height of the lowest marker or feature."
         findings.append(Finding("poses-origin", "amber", sentence))
@@ -271,7 +273,8 @@ def _posed(
 
 
 def _no_scale(advice: str) -> Finding:
-    sentence = f"Nothing gives the scale: lengths are in units of the camera's distance from the axis; {advice}."
+    unit = "lengths are in units of the camera's distance from the axis"
+    sentence = f"Nothing gives the scale: {unit}; {advice} in session.json."
     return Finding("poses-no-scale", "amber", sentence)
 
 

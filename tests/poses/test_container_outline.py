@@ -9,7 +9,7 @@ from exact_turntable import marker_turntable, point_turntable
 from scipy.spatial.transform import Rotation
 from turntable_scene import MarkerScene
 
-from hsi_sc_nerf.geometry.camera import project
+from hsi_sc_nerf.geometry.camera import project_distorted
 from hsi_sc_nerf.poses.container_outline import container_outline, radius_by_camera
 
 RADIUS_M, HEIGHT_M, OVER = 0.045, 0.07, 8
@@ -21,7 +21,7 @@ def turntable():
     return scene, point_turntable(marker_turntable(scene), 100)
 
 
-def drawn(scene, shift_m, contrast):
+def drawn(scene, shift_m, contrast, k1=0.0):
     """Frames of a container before a noisy, patterned wall; its lid is at its height above z = 0."""
     rng = np.random.default_rng(0)
     wall = cv2.GaussianBlur(rng.normal(size=(192, 192)), (0, 0), 3.0)
@@ -29,8 +29,8 @@ def drawn(scene, shift_m, contrast):
     for pose in scene.camera_to_world:
         around = np.linspace(0.0, 2.0 * np.pi, 90)
         rim = RADIUS_M * np.stack([np.cos(around), np.sin(around)], axis=-1) + [shift_m, 0.0]
-        corners = np.concatenate([np.column_stack([rim, np.full(90, z)]) for z in (0.0, HEIGHT_M)])
-        pixels, _ = project(corners, pose, scene.intrinsics)
+        corners = np.concatenate([np.column_stack([rim, np.full(90, z)]) for z in np.linspace(0.0, HEIGHT_M, 8)])
+        pixels = project_distorted(corners, pose, scene.intrinsics, np.array([k1, 0.0, 0.0, 0.0]))
         hull = cv2.convexHull(np.float32(pixels * OVER)).astype(np.int32)
         covered = cv2.fillConvexPoly(np.zeros((192 * OVER, 192 * OVER), np.float32), hull, 1.0)
         covered = cv2.resize(covered, (192, 192), interpolation=cv2.INTER_AREA)
@@ -53,6 +53,16 @@ def test_radius_and_foot_are_those_of_the_drawn_container(turntable, shift_m, en
     assert found.radius_sigma < 0.015
     assert found.foot == pytest.approx(-camera_m, abs=2.0 * found.foot_sigma)
     assert found.foot_sigma < 0.002
+
+
+def test_a_distorted_lens_shows_the_same_container(turntable):
+    scene, machine = turntable
+    camera_m, points_3d = scene.first_camera_to_world[2, 3], machine.points_3d.copy()
+    points_3d[:, 2] += HEIGHT_M - camera_m - np.percentile(points_3d[:, 2], 1.0)
+    machine = replace(machine, points_3d=points_3d, radial=(-2.0, 0.0))
+    found = container_outline(drawn(scene, 0.0, 60.0, machine.radial[0]), machine, HEIGHT_M / RADIUS_M / 2.0)
+    assert found.radius == pytest.approx(RADIUS_M, rel=2.0 * found.radius_sigma)
+    assert found.foot == pytest.approx(-camera_m, abs=2.0 * found.foot_sigma)
 
 
 def test_pictures_that_lie_on_their_side_show_the_same_container(turntable):

@@ -13,7 +13,7 @@ from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, PinholeIntrinsics
 from hsi_sc_nerf.poses.bundle_adjustment import FreeParameters
 from hsi_sc_nerf.poses.feature_poses import KnownCamera, check_camera, poses_from_sfm, prior_of_angles
 from hsi_sc_nerf.poses.structure_from_motion import FreePoses
-from hsi_sc_nerf.poses.track_adjustment import adjust_together, adjust_tracks
+from hsi_sc_nerf.poses.track_adjustment import adjust_together, adjust_tracks, with_markers
 
 
 @pytest.fixture(scope="module")
@@ -58,15 +58,38 @@ def test_an_earlier_camera_holds_and_is_contradicted_where_it_zoomed(session):
     assert [finding.level for finding in check_camera(adjusted, found, leaning)] == ["red"]
 
 
-def by_features(true, tracks, roll_deg=0.0, **known):
+def by_features(true, tracks, roll_deg=0.0, *, images=None, info=None, **known):
     """Poses from free poses and tracks that COLMAP would find of a turntable, in rolled pictures."""
     roll = Rotation.from_euler("z", roll_deg, True).as_matrix()
     poses = np.linalg.inv(true.camera_to_world() @ OPENCV_TO_OPENGL)
     poses[:, :3] = roll @ poses[:, :3]
     pixels = (tracks.pixels - true.centre_px) @ roll[:2, :2].T + true.centre_px
     free = FreePoses(poses, true.focal_px, true.centre_px, true.points_3d, replace(tracks, pixels=pixels))
-    blank, names = [np.zeros((256, 256), np.uint8)] * len(poses), [f"f{i}" for i in range(len(poses))]
-    return poses_from_sfm(blank, names, SessionInfo(marker_dictionary="DICT_4X4_50"), free=free, **known)
+    images = images or [np.zeros((256, 256), np.uint8)] * len(poses)
+    info = info or SessionInfo(marker_dictionary="DICT_4X4_50")
+    return poses_from_sfm(images, [f"f{i}" for i in range(len(poses))], info, free=free, **known)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shown", [True, False])
+def test_the_outline_gives_the_scale_beside_markers_of_unknown_side(session, shown):
+    scene, true, _ = session
+    points_3d = true.points_3d.copy()
+    points_3d[:, 2] += 0.07 - scene.first_camera_to_world[2, 3] - np.percentile(points_3d[:, 2], 1.0)
+    true, images = replace(points_alone(true), points_3d=points_3d / true.distance), scene.render()
+    size = {"container_diameter_m": 0.09, "container_height_m": 0.07} if shown else {}
+    info = SessionInfo(marker_dictionary="DICT_5X5_50", **size)
+    poses = by_features(true, point_tracks(true, noise_px=0.05), images=images, info=info)
+    assert len(poses.disc_markers) == 2
+    told = [finding.sentence for finding in poses.findings if finding.name == "poses-no-scale"]
+    if shown:
+        assert (poses.scale.source, told) == ("outline", [])
+        assert np.hypot(*poses.camera_to_world[0, :2, 3]) == pytest.approx(
+            scene.first_camera_to_world[0, 3], rel=0.02
+        )
+    else:
+        assert "container" in told[0]
+        assert "show markers" not in told[0]
 
 
 @pytest.mark.slow
@@ -80,6 +103,28 @@ def test_the_object_stands_on_its_feet_unless_pictures_are_upside_down(session, 
         poses.angles_deg, (-1.0 if upside_down else 1.0) * np.rad2deg(true.angles_rad), atol=0.5
     )
     assert ("poses-upright" in {finding.name for finding in poses.findings}) == upside_down
+
+
+def test_markers_seen_through_a_distorted_lens_are_placed(session):
+    _, true, _ = session
+    true = replace(true, radial=(-0.3, 0.1))
+    bare = replace(true, markers=true.markers[:0], marker_poses=true.marker_poses[:0])
+    found = with_markers(bare, marker_observations(true, noise_px=0.0))
+    assert found.side == pytest.approx(true.side, rel=1e-6)
+    np.testing.assert_allclose(found.marker_poses, true.marker_poses, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_an_earlier_camera_keeps_its_distortion(session):
+    scene, true, _ = session
+    true = replace(points_alone(true), radial=(-0.1, 0.02))
+    camera = replace(known_camera(scene), distortion=(*true.radial, 0.0, 0.0))
+    poses = by_features(true, point_tracks(true, noise_px=0.02), camera=camera)
+    assert poses.distortion == camera.distortion
+    assert poses.camera_given
+    np.testing.assert_allclose(poses.angles_deg, np.rad2deg(true.angles_rad), atol=0.1)
+    assert poses.reprojection_error_px.max() < 0.05
+    assert "poses-camera" not in {finding.name for finding in poses.findings}
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
