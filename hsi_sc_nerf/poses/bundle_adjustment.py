@@ -210,7 +210,7 @@ class Problem:
             turntable = replace(turntable, motion=np.zeros((len(turntable.frames), 5)))
         cost, damping = self.cost(turntable), _FIRST_DAMPING
         if not np.isfinite(cost):
-            raise InputError("the object's points lie behind the camera; the poses to start from are wrong")
+            raise InputError("first poses put points behind the camera; take smaller steps, or show more markers")
         for _ in range(_MOST_STEPS):
             equations = self.normal_equations(turntable)
             while True:

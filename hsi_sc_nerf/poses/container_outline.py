@@ -16,6 +16,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from hsi_sc_nerf.geometry.camera import cross_matrix
 from hsi_sc_nerf.poses.turntable import Turntable
+from hsi_sc_nerf.robust_scatter import robust_std
 
 # Radii that are tried, over that of most points; and how far the edges of one frame may lie from those of all.
 _RADII = (0.4, 1.6)
@@ -95,7 +96,7 @@ def container_outline(
         sides, (arc,) = _gradients(picture, turntable, edges), _gradients(picture, turntable, arcs)
         row[:] = np.mean([_peak(radii, side) for side in sides]), _peak(feet, arc)
     radius, foot = np.median(found, axis=0).tolist()
-    scatter = 1.5 * np.median(np.abs(found - [radius, foot]), axis=0)
+    scatter = robust_std(found - [radius, foot], axis=0)
     if scatter[0] > _LARGEST_SPREAD * radius:
         return None
     # What a pixel is, in the turntable's unit, across the line of sight; the foot is seen from above.

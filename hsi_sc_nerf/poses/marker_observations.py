@@ -74,7 +74,7 @@ def observe_markers(images: Sequence[UInt8[np.ndarray, "h w"]], dictionary: str)
             blurs_px[i][name] = find_blur([frames[i].picture(name)], dictionary, [found])
         fitted[i] = refine(i)
     rows = [(i, m, fit) for i, found in enumerate(fitted) for m, fit in found if fit is not None]
-    why = "its pattern does not explain the pixels: hidden, blurred or misread"
+    why = "hidden, blurred or misread, for the pattern does not explain the pixels"
     unexplained = tuple(
         RejectedMarker(i, m, None, why) for i, found in enumerate(fitted) for m, fit in found if fit is None
     )

@@ -130,5 +130,7 @@ def _dropped(names: Sequence[str], used: np.ndarray, rejected: Sequence[Rejected
     dropped = {}
     for f in np.flatnonzero(~used).tolist():
         why = reasons.get(f)
-        dropped[names[f]] = f"its markers were rejected: {why.most_common(1)[0][0]}" if why else "no marker was found"
+        dropped[names[f]] = (
+            f"markers that cannot be used: {why.most_common(1)[0][0]}" if why else "no marker was found"
+        )
     return dropped

@@ -76,12 +76,12 @@ def usable(seen: MarkerObservations) -> tuple[MarkerObservations, list[RejectedM
             static.append(marker)
     stands = np.isin(seen.marker, static)
     once = np.array([count[m] < 2 for m in seen.marker.tolist()], bool)
-    rejected = _rejected(seen.select(stands), "it stands still in the image")
-    rejected += _rejected(seen.select(once), "it is seen in no other frame")
+    rejected = _rejected(seen.select(stands), "still in the image while the table turns")
+    rejected += _rejected(seen.select(once), "seen in no other frame")
     kept = seen.select(~stands & ~once)
     if len(kept):
         linked = linked_rows(kept.frame, kept.marker)
-        rejected += _rejected(kept.select(~linked), "it links its frame with too few others")
+        rejected += _rejected(kept.select(~linked), "linking the frame with too few others")
         kept = kept.select(linked)
     return kept, rejected, sorted(static)
 
@@ -122,7 +122,7 @@ def adjust_without_outliers(
         good = fits
     of_displaced = np.isin(observations.frame, list(displaced))
     outliers = ~good & ~of_displaced
-    rejected = _rejected(observations.select(outliers), "it does not fit the others", errors_px[outliers])
+    rejected = _rejected(observations.select(outliers), "contradicting the others", errors_px[outliers])
     return best, kept, rejected + _rejected_frames(observations.select(of_displaced), displaced)
 
 
@@ -147,7 +147,7 @@ def without_uncertain_frames(
         )
     kept = observations.select(keep)
     better, certain = _select_model(adjusted.turntable, kept)
-    why = f"it determines the angle worse than to {_LARGEST_ANGLE_SIGMA_DEG} degrees"
+    why = f"giving the angle with an error above {_LARGEST_ANGLE_SIGMA_DEG} degrees"
     displaced = kept.select(np.isin(kept.frame, list(better.displaced_frames)))
     rejected = _rejected(observations.select(~keep), why)
     return better, certain, rejected + _rejected_frames(displaced, better.displaced_frames)

@@ -20,6 +20,7 @@ from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, PixelFlag
 from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES
+from hsi_sc_nerf.robust_scatter import robust_std
 from hsi_sc_nerf.spectra import to_8_bit
 
 GRAY, GRAY_NM = "gray", (450.0, 700.0)
@@ -48,7 +49,7 @@ _EDGE_FRACTION = 0.02
 _ROUNDING = 1.0 / (255.0 * np.sqrt(12.0))
 # J. Immerkær, "Fast noise variance estimation" (1996): it removes steps and slopes, and multiplies noise by 6.
 _NOISE_MASK = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
-_NOISE_GAIN, _MEDIAN_OF_NORMAL = 6.0, 0.6745
+_NOISE_GAIN = 6.0
 # Lines of a cube that are worked on at a time, and frames that are read at the same time.
 _BLOCK_LINES = 32
 _WORKERS = 2
@@ -233,8 +234,8 @@ def edge_precision(
         return 0.0
     picture = np.asarray(reflectance, np.float32)
     bright = whole & (picture >= np.median(picture[whole]))
-    curvature = np.abs(cv2.filter2D(picture, cv2.CV_32F, _NOISE_MASK)[bright])
-    noise = float(np.median(curvature)) / (_NOISE_GAIN * _MEDIAN_OF_NORMAL * np.sqrt(bands))
+    curvature = cv2.filter2D(picture, cv2.CV_32F, _NOISE_MASK)[bright]
+    noise = float(robust_std(curvature)) / (_NOISE_GAIN * np.sqrt(bands))
     return edge_slope(picture, whole) / float(np.hypot(noise, _ROUNDING))
 
 

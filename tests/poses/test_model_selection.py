@@ -225,8 +225,8 @@ def test_markers_that_cannot_count_are_named_with_the_reason():
     assert stands_still == [40]
     assert len(kept) == len(observations)
     assert {(r.marker, r.why) for r in rejected} == {
-        (40, "it stands still in the image"),
-        (41, "it is seen in no other frame"),
+        (40, "still in the image while the table turns"),
+        (41, "seen in no other frame"),
     }
 
 
