@@ -46,7 +46,7 @@ class SessionInfo:
         marker_side_m: side of a marker's black square.
         container_diameter_m: diameter of the upright cylinder that the object stands on.
         container_height_m: height of the cylinder's lid above the disc.
-        frame_angles_deg: the turntable's angle in each frame, for uneven, known steps.
+        frame_angles_deg: readings of the turntable's scale, one a capture, for uneven, known steps.
         camera_distance_m: of the camera from the turntable's axis; sets the scale of a session without markers.
         white_reference: name of the capture of the white tarp.
         band_centres: a CSV beside ``session.json`` with the band centres in nm, for headers that list none.
