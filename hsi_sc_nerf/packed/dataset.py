@@ -108,8 +108,7 @@ class PackedDataset:
         flagged_values: number of values that are ``FLAGGED``, in all cubes.
         bad_bands_nm: centres of the bands that were left out because they measure nothing.
         fwhm_nm: full widths at half maximum of the bands; None if they are unknown.
-        uncertainty: uncertainty of the reflectance; None if it is unknown (finished reflectance, or noise
-            that could not be measured).
+        uncertainty: uncertainty of the reflectance; None if it is unknown (finished reflectance, unmeasured noise).
         typical_uncertainty: standard deviation by band at the object's mean reflectance; None likewise.
         pose_method: how the poses were estimated ("markers", "colmap", "angles"); None if that is unknown.
         metric: whether lengths are metres; else nothing gave the scale: the camera's distance from the axis is 1.
