@@ -150,6 +150,8 @@ def measure_traits(
         traits = analyse(surface, [*picked, *drawn_regions], classes, pixel_m, maps, class_maps)
         unsupervised = find_components(surface, components) if components else None
     settings = {**asdict(config), "splits": splits, "max_incidence_deg": max_incidence_deg}
+    if dataset is not None and not dataset.metric:
+        settings["metric"] = False
     return Measurement(surface, size_of(closed), uncertainty, traits, unsupervised, settings)
 
 

@@ -143,6 +143,8 @@ def trait_tables(content: Mapping[str, Any]) -> list[TraitTable]:
     state = "watertight" if content["watertight"] else "NOT watertight, so its volume cannot be trusted"
     closed_cm2 = CM2_PER_M2 * (size["area_m2"] - seen_m2)
     note = f"The mesh is {state}. {closed_cm2:.1f} cm² of its area, mainly the base, were not seen but closed."
+    if content.get("settings", {}).get("metric") is False:
+        note = f"Sizes are wrong: nothing gave the session's scale, and 1 m is the camera's distance. {note}"
     if spread:
         note += f" ± is the standard deviation by {_listed(content['size_sd_by_cause'])}."
         missing = [words for cause, words in _CAUSES.items() if cause not in content["size_sd_by_cause"]]

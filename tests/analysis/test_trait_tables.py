@@ -37,6 +37,22 @@ def test_sizes_have_the_decimals_of_their_uncertainty(height_m, sd_m, shown):
     assert ("the scale" in sizes.note) == (sd_m is not None)
 
 
+@pytest.mark.parametrize("settings", [{}, {"metric": False}])
+def test_sizes_of_a_session_without_a_scale_are_said_to_be_wrong(settings):
+    content = {
+        "settings": settings,
+        "size": dict.fromkeys(SIZES, 0.07),
+        "size_sd": None,
+        "size_sd_by_cause": {},
+        "seen_area_m2": 0.01,
+        "watertight": True,
+        "classes": None,
+        "regions": {WHOLE: {"area_m2": 0.01, "indices": {}, "reflectance": {"mean": 0.4, "std": None}}},
+    }
+    sizes, _ = trait_tables(content)
+    assert ("wrong" in sizes.note) == bool(settings)
+
+
 @pytest.mark.parametrize(("std", "shown"), [(0.021, "0.530 ± 0.021"), (None, "0.53")])
 def test_the_light_of_a_region_stands_beside_its_brightness(std, shown):
     of_spot = {"mean": 0.377, "std": 0.004, "measured": 0.2, "irradiance": 0.53, "irradiance_std": std}
