@@ -185,7 +185,7 @@ def test_clouds_that_cannot_be_written_are_refused_before_rendering(run, tmp_pat
         export_cloud(run, tmp_path, CloudOptions(roi_masks=tmp_path))
     monkeypatch.setattr(formats, "LAS_MAX_DIMENSIONS", 10)
     (tmp_path / "point_cloud.zarr").mkdir()
-    for file_format, message in (("las", "LAS has room for 2 bands"), ("zarr", "is not a Zarr folder")):
+    for file_format, message in (("las", r"LAS has room for \d bands"), ("zarr", "is not a Zarr folder")):
         pytest.importorskip({"las": "laspy"}.get(file_format, file_format))
         with pytest.raises(InputError, match=message):
             export_cloud(run, tmp_path, CloudOptions(format=file_format))
