@@ -204,24 +204,19 @@ def _numbers(path: Path, fields: dict[str, Any], key: str, count: int) -> Float[
     if listed in ("", [""]):
         return None
     values = [str(value) for value in np.atleast_1d(listed)]
-    for value in values:
-        if not _is_number(value):
+    numbers = np.empty(len(values))
+    for i, value in enumerate(values):
+        try:
+            numbers[i] = float(value)
+        except ValueError as error:
             does = "lists" if count > 1 else "is"
-            raise InputError(f"{path}: {key} {does} {value!r}, which is not a number; write the number alone.")
-    numbers = np.array([float(value) for value in values])
+            sentence = f"{path}: {key} {does} {value!r}, which is not a number; write the number alone."
+            raise InputError(sentence) from error
     if len(numbers) != count:
         raise InputError(f"{path}: {key} lists {len(numbers)} numbers for {count} bands; correct the list.")
     if count > 1 and (not np.isfinite(numbers).all() or numbers.min() < 0.0):
         raise InputError(f"{path}: {key} holds numbers that are negative or not finite; correct the list.")
     return numbers
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _wavelengths(path: Path, fields: dict[str, Any], bands: int) -> tuple[float, Float[np.ndarray, "bands"] | None]:
