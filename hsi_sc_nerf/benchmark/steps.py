@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _PACKAGES = ("hsi-sc-nerf", "nerfstudio", "torch", "numpy")
+SPINS = 3000
+"""Times that a thread of OpenMP looks whether another one is ready before it sleeps, about ten microseconds. By default
+it looks for a millisecond; on a busy machine the other one does not run meanwhile (docs/how-to/run.md)."""
 _RSS_UNIT_BYTES = 1 if sys.platform == "darwin" else 1024
 
 
@@ -59,7 +62,8 @@ def run_step(
     started = time.perf_counter()
     # Warnings of libraries would hide the progress bars. Nothing here is compiled by PyTorch, but nerfstudio's import
     # compiles two functions of a method that is not used, for which PyTorch loads its compiler for seconds.
-    environment = {"TORCHDYNAMO_DISABLE": "1"} | os.environ | {"PYTHONWARNINGS": "ignore"}
+    defaults = {"TORCHDYNAMO_DISABLE": "1", "GOMP_SPINCOUNT": str(SPINS)}
+    environment = defaults | os.environ | {"PYTHONWARNINGS": "ignore"}
     if environment.pop("PYTHONDONTWRITEBYTECODE", None):
         # Compiled modules halve the start of nerfstudio; they are kept beside the log.
         environment["PYTHONPYCACHEPREFIX"] = str(log.parent.resolve() / "pycache")

@@ -28,7 +28,7 @@ from hsi_sc_nerf.benchmark.run import (
     Checkpoint,
     HeldOutViews,
 )
-from hsi_sc_nerf.benchmark.steps import run_step
+from hsi_sc_nerf.benchmark.steps import SPINS, run_step
 from hsi_sc_nerf.cli import benchmark
 from hsi_sc_nerf.cli.benchmark import BenchmarkCommand
 from hsi_sc_nerf.errors import InputError
@@ -264,6 +264,16 @@ def test_a_step_that_the_system_ended_says_so(tmp_path, code, told, cause):
         run_step("train", [sys.executable, "-S", "-c", code], tmp_path / "train.log")
     assert str(tmp_path / "train.log") in str(error.value)
     assert ("memory" in str(error.value)) == cause
+
+
+@pytest.mark.parametrize("own", [None, "7"])
+def test_threads_of_a_step_do_not_spin_long_unless_the_user_says_so(tmp_path, monkeypatch, own):
+    monkeypatch.delenv("GOMP_SPINCOUNT", raising=False)
+    if own is not None:
+        monkeypatch.setenv("GOMP_SPINCOUNT", own)
+    log = tmp_path / "step.log"
+    run_step("step", [sys.executable, "-S", "-c", "import os; print(os.environ['GOMP_SPINCOUNT'])"], log)
+    assert log.read_text() == f"{own or SPINS}\n"
 
 
 def test_where_processes_are_not_measured_the_system_is_named(tmp_path, monkeypatch):
