@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _PACKAGES = ("hsi-sc-nerf", "nerfstudio", "torch", "numpy")
 SPINS = 3000
-"""Times that a thread of OpenMP looks whether another one is ready before it sleeps, about ten microseconds. By default
-it looks for a millisecond; on a busy machine the other one does not run meanwhile (docs/how-to/run.md)."""
+"""Times that a thread of OpenMP looks whether another one is ready before it sleeps, about ten microseconds. By
+default it looks for a millisecond; on a busy machine the other one does not run meanwhile (docs/how-to/run.md)."""
 _RSS_UNIT_BYTES = 1 if sys.platform == "darwin" else 1024
 
 
