@@ -335,7 +335,7 @@ def _check_noise(session: Session, calibration: SessionCalibration) -> Finding:
     if not (noise.read_noise_measured and noise.photon_noise_measured):
         unknown = {"read noise": noise.read_noise_measured, "photon noise": noise.photon_noise_measured}
         what = " and the ".join(name for name, measured in unknown.items() if not measured)
-        sentence = f"the {what} was not measured, so no uncertainty is stated and the spectra tell the noise"
+        sentence = f"the {what} could not be measured, so no uncertainty is stated and the spectra tell the noise"
         advice = "a white that fills the image, or dark cubes of several lines, would tell it"
         return Finding("noise", "amber", f"{session.path}: {sentence}; {advice}.", values)
     return Finding("noise", "green", f"Noise: {text}.", values)

@@ -227,9 +227,9 @@ class StagedTrainer(Trainer):
 
         if sampler is not None:
             self._steps_since_update = sampler._steps_since_update + 1
-        skipped = self.optimizers.skipped_groups
-        names = non_finite_names(loss_dict) if skipped or self.grad_scaler.is_enabled() else []
-        warning = self._guard.record(step, names, skipped)
+        total = float(loss.detach())  # of all terms: finite only if each is
+        names = [] if math.isfinite(total) else non_finite_names(loss_dict)
+        warning = self._guard.record(step, names, self.optimizers.skipped_groups)
         if warning is not None:
             CONSOLE.print(f"[yellow]{escape(warning)}")
         if step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
@@ -240,7 +240,7 @@ class StagedTrainer(Trainer):
         self.schedule.end_step(step)
         self._trained_step = step
         self.stop_training |= self.schedule.complete
-        self._risen_loss.record(step, self.schedule, float(loss.detach()))
+        self._risen_loss.record(step, self.schedule, total)
         return loss, loss_dict, metrics_dict
 
     def _captured_iteration(self, steps: CapturedSteps, step: int) -> TRAIN_INTERATION_OUTPUT:

@@ -142,6 +142,15 @@ def test_a_poisoned_step_is_skipped_and_named(tiny_dataset, tmp_path, capsys):
 
 
 @pytest.mark.slow
+def test_a_loss_that_is_not_finite_is_named_even_if_its_gradient_is(tiny_dataset, tmp_path, capsys):
+    made = trainer(tiny_dataset, tmp_path)
+    original = made.pipeline.model.get_loss_dict
+    made.pipeline.model.get_loss_dict = lambda *words: original(*words) | {"odd_loss": torch.tensor(float("inf"))}
+    made.train()
+    assert "step 2 skipped: loss odd_loss" in capsys.readouterr().out
+
+
+@pytest.mark.slow
 def test_a_run_that_keeps_failing_stops_with_its_last_good_weights(tiny_dataset, tmp_path):
     made = trainer(tiny_dataset, tmp_path, max_num_iterations=30)
     poison(made, range(1, 30))
