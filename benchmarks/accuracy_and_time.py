@@ -62,6 +62,8 @@ STEPS_A_TURN = 10
 SETTLING_TURNS = 12
 """Turns that are not timed: by then the occupancy grid has emptied most of the hull."""
 TIMED_TURNS = 8
+DEFAULT_TURNS = 4
+"""Rows after which it is the default's turn again: all ratios are to its step, so it is timed more often."""
 TIMED_RUN = 10_000
 """Steps of the run that the timed turns are a part of."""
 _RAYS = "--pipeline.datamanager.train-num-rays-per-batch"
@@ -258,9 +260,13 @@ def step_seconds(runs: Mapping[str, tuple[Path, str]], common: str) -> dict[str,
             job = Job("hsi-sc-nerf", all_words, str(data), folder, TIMED_RUN, None, "cpu", (), 1, None)
             trainers[name] = build_trainer(job)
             trainers[name]._show_progress = lambda step, psnr_db: None
-        seconds = dict.fromkeys(trainers, 0.0)
+        seconds, steps = dict.fromkeys(trainers, 0.0), dict.fromkeys(trainers, 0)
+        others = [name for name in trainers if name != DEFAULT]
+        blocks = [others[start : start + DEFAULT_TURNS] for start in range(0, len(others), DEFAULT_TURNS)]
+        order = [name for block in blocks or [[]] for name in (DEFAULT, *block)]
         for turn in range(SETTLING_TURNS + TIMED_TURNS):
-            for name, trainer in trainers.items():
+            for name in order:
+                trainer = trainers[name]
                 trainer.pipeline.train()
                 # Timed turns are spread over the whole run: a step's cost differs between the stages.
                 timed = turn - SETTLING_TURNS
@@ -269,8 +275,9 @@ def step_seconds(runs: Mapping[str, tuple[Path, str]], common: str) -> dict[str,
                 for step in range(first, first + STEPS_A_TURN):
                     trainer.train_iteration(step)
                 if timed >= 0:
-                    seconds[name] += (time.process_time() - before) / (TIMED_TURNS * STEPS_A_TURN)
-    return seconds
+                    seconds[name] += time.process_time() - before
+                    steps[name] += STEPS_A_TURN
+    return {name: seconds[name] / steps[name] for name in trainers}
 
 
 def surface_figures(config: Path, session: Path) -> dict[str, float]:
