@@ -37,6 +37,9 @@ DARK_SIGMAS = 3.0
 """A value is dark if it exceeds the dark cube by less than this many standard deviations."""
 BRIGHT_PERCENTILE = 95.0
 """Percentile of a picture that counts as its brighter part."""
+MARKERS_PERCENTILE = 99.5
+"""Percentile of a picture that is white where markers are sought: in a dark chamber, paper may fill less than the
+brighter part, and highlights fill less than the rest."""
 WORKERS = 2
 
 
@@ -70,10 +73,10 @@ class Quicklook:
     def gray(self) -> UInt8[np.ndarray, "lines samples"]:
         """Mean of the picture's channels, which is searched for markers.
 
-        White is the picture's brighter part: markers are seen even if a header states a wrong integration time.
+        White is the picture's brightest part: markers are seen even if a header states a wrong integration time.
         """
         mean = self.picture.mean(axis=-1)
-        return to_8_bit(mean / max(float(np.percentile(mean, BRIGHT_PERCENTILE)), 1e-9))
+        return to_8_bit(mean / max(float(np.percentile(mean, MARKERS_PERCENTILE)), 1e-9))
 
 
 def quicklooks_of(session: Session) -> list[Quicklook]:

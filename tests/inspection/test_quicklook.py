@@ -10,7 +10,8 @@ from inspection_session import INFO, SIZE_PX, WAVELENGTHS_NM, rendered, write_on
 from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.inspection.inspect import inspect_session
-from hsi_sc_nerf.inspection.quicklook import quicklooks_of, reflectance_noise
+from hsi_sc_nerf.inspection.quicklook import Quicklook, quicklooks_of, reflectance_noise
+from hsi_sc_nerf.poses.marker_detection import detect_markers, marker_pattern
 
 WHITE = 0.98
 """Of the scene; what is as bright counts as 1."""
@@ -22,6 +23,31 @@ def write_white(folder, reflectance, **fields):
 
 def brightness(folder):
     return float(quicklooks_of(open_session(folder))[0].picture.mean())
+
+
+@pytest.mark.parametrize("wall", [0.02, 0.2])
+@pytest.mark.parametrize("highlights", [0.0, 0.003])
+@pytest.mark.parametrize("exposed", [0.2, 1.0, 5.0])
+def test_markers_in_a_dark_chamber_that_paper_hardly_fills(wall, highlights, exposed):
+    picture = np.full((256, 256), wall)
+    picture.ravel()[: round(highlights * picture.size)] = 4.0
+    for number in range(2):
+        picture[100:140, 60 + 80 * number : 100 + 80 * number] = 0.85
+        pattern = marker_pattern("DICT_5X5_50", number).repeat(4, axis=0).repeat(4, axis=1)
+        picture[106:134, 66 + 80 * number : 94 + 80 * number] = np.where(pattern, 0.85, 0.04)
+    nothing = np.zeros((1, 1))
+    look = Quicklook(
+        name="fruit",
+        picture=exposed * np.repeat(picture[..., None], 3, axis=-1),
+        top_counts=1.0,
+        at_top_fraction=nothing[0],
+        dark_fraction=nothing[0],
+        sharpness_per_px=0.0,
+        digest="",
+        dark_spectrum=None,
+        bright_spectra=nothing,
+    )
+    assert sorted(detect_markers(look.gray, "DICT_5X5_50")) == [0, 1]
 
 
 @pytest.mark.parametrize("times_as_long", [0.8, 5.0])
