@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+import filecmp
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -42,6 +43,29 @@ def turn_of(frames: Sequence[str], left_out: Collection[str]) -> tuple[str, ...]
     words = [word for word in _WHITE_WORDS if not any(word in name.lower() for name in frames)]
     objects = {name for name in left_out if not any(word in name.lower() for word in words)}
     return tuple(sorted(objects.union(frames), key=natural_order))
+
+
+def copies_of_others(kept: Iterable[Path], left_out: Mapping[str, Path]) -> set[str]:
+    """Names of captures that are left out and copies of others: the table did not turn for them.
+
+    Args:
+        kept: data files of the captures that are kept.
+        left_out: data files of those that are left out, by name.
+    """
+    others, copies = list(kept), set()
+    for name, path in left_out.items():
+        if any(_are_equal(path, other) for other in others):
+            copies.add(name)
+        others.append(path)
+    return copies
+
+
+def _are_equal(one: Path, other: Path) -> bool:
+    """Whether two files hold the same bytes; files of different captures differ in the first of them."""
+    try:
+        return filecmp.cmp(one, other, shallow=False)
+    except OSError:  # what is left out need not be readable
+        return False
 
 
 def with_angles_of(info: SessionInfo, frames: Sequence[str], turn: Sequence[str]) -> SessionInfo:

@@ -22,7 +22,7 @@ from hsi_sc_nerf.capture.instrument import (
     usual_rotation_deg,
     with_band_widths,
 )
-from hsi_sc_nerf.capture.roles import damaged_captures, turn_of, white_name, with_angles_of
+from hsi_sc_nerf.capture.roles import copies_of_others, damaged_captures, turn_of, white_name, with_angles_of
 from hsi_sc_nerf.capture.session_info import SESSION_INFO_NAME, SessionInfo, read_band_centres, read_session_info
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.spectra import SAME_BAND_NM, listed_twice
@@ -89,7 +89,8 @@ class Session:
         damaged: captures that cannot be used and are left out, by name, with the reason.
         skipped: folders and cubes that are no captures, by name, with the reason.
         excluded: captures that the user leaves out.
-        turn: names of all captures of the turning object in their order, with those that are damaged or excluded.
+        turn: names of all captures of the turning object in their order, with those that are damaged or excluded;
+            without excluded copies of others.
     """
 
     path: Path
@@ -191,9 +192,11 @@ def open_session(path: Path, *, exclude: Collection[str] = (), skip_damaged: boo
     unknown = set(exclude) - {files.name for files in found.captures} - set(found.damaged) - set(found.skipped)
     if unknown:
         raise InputError(f"{path}: has no capture {', '.join(sorted(unknown))} to leave out; check the name.")
-    damaged = {name: reason for name, reason in found.damaged.items() if name not in exclude}
     kept = [files for files in found.captures if files.name not in exclude]
-    captures = open_captures(kept, info, path, damaged)
+    damaged = dict(found.damaged)
+    opened = open_captures(sorted(found.captures, key=lambda files: files.name in exclude), info, path, damaged)
+    damaged = {name: reason for name, reason in damaged.items() if name not in exclude}
+    captures = [capture for capture in opened if capture.name not in exclude]
     info = replace(info, white_reference=white_name(info, [*(files.name for files in kept), *damaged]))
     white = info.white_reference.lower()
     broken_white = next((reason for name, reason in damaged.items() if name.lower() == white), None)
@@ -215,11 +218,16 @@ def open_session(path: Path, *, exclude: Collection[str] = (), skip_damaged: boo
     if rotation_deg is None:
         rotation_deg = usual_rotation_deg(frames[0].cube)
     names = [frame.name for frame in frames]
-    not_opened = {files.name for files in found.captures} - {capture.name for capture in captures}
-    turn = turn_of(names, {*not_opened, *found.damaged, *damaged})
+    left_out = {files.name for files in found.captures} - {capture.name for capture in captures}
+    every = turn_of(names, {*left_out, *found.damaged, *damaged})
+    copies = copies_of_others(
+        [capture.cube.data_path for capture in captures],
+        {capture.name: capture.cube.data_path for capture in opened if capture.name in exclude},
+    )
+    turn = tuple(name for name in every if name not in copies)
     return Session(
         path,
-        with_angles_of(info, names, turn),
+        with_angles_of(with_angles_of(info, names, every), names, turn),
         tarp,
         tuple(frames),
         rotation_deg,

@@ -19,17 +19,17 @@ from hsi_sc_nerf.calibration.white_source import WhiteSource
 from hsi_sc_nerf.capture.session import Session, open_session
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.findings import Finding, names_in_short
+from hsi_sc_nerf.findings import Finding, Level, names_in_short
 from hsi_sc_nerf.inspection.capture_checks import check_files, check_frames
 from hsi_sc_nerf.inspection.marker_checks import Markers, check_markers, find_markers
 from hsi_sc_nerf.inspection.paper_check import check_paper
 from hsi_sc_nerf.inspection.quicklook import Quicklook, quicklooks_of
 from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure, show_image
-from hsi_sc_nerf.poses.known_angles import known_angles_deg, required_angles_deg
+from hsi_sc_nerf.poses.known_angles import are_assumed, known_angles_deg, required_angles_deg
 from hsi_sc_nerf.poses.pose_methods import PoseMethod
 
-WHOLE_TURN_DEG = 0.05
-"""Frames that fill a turn to this fraction are taken for one whole turn."""
+WHOLE_TURN_FRACTION = 0.05
+"""Captures that fill a turn up to this fraction are taken for one whole turn."""
 THUMBNAIL_COLUMNS = 12
 THUMBNAIL_PX = 112
 THUMBNAIL_GAMMA = 1.0 / 2.2
@@ -140,11 +140,21 @@ def filled_in(session: Session, markers: Markers) -> dict[str, object]:
         content |= {"marker_dictionary": markers.dictionary, "marker_side_m": None}
     step = markers.usual_step_deg
     if step is not None:
-        turn = abs(step) * len(session.frames)
-        whole = abs(turn / 360.0 - 1.0) < WHOLE_TURN_DEG
-        content["nominal_step_deg"] = round(360.0 / len(session.frames), 3) if whole else round(2.0 * abs(step)) / 2.0
+        content["nominal_step_deg"] = _nominal_step_deg(session, abs(step))
         content["direction"] = "ccw" if step > 0.0 else "cw"
     return content | stated
+
+
+def _nominal_step_deg(session: Session, usual_step_deg: float) -> float:
+    """Step from place to place in the turn, by the usual step from frame to frame.
+
+    The markers show whether the captures that are left out belong to a whole turn: of both counts, the one that fits
+    the step better is taken.
+    """
+    step = usual_step_deg / float(np.median(np.diff(session.places)))
+    count = min(len(session.turn), len(session.frames), key=lambda captures: abs(captures * step - 360.0))
+    whole = abs(count * step / 360.0 - 1.0) < WHOLE_TURN_FRACTION
+    return round(360.0 / count, 3) if whole else round(2.0 * step) / 2.0
 
 
 def suggestion(session: Session, content: dict[str, object]) -> str:
@@ -190,9 +200,9 @@ def check_angles(session: Session, poses: PoseMethod, markers: Markers) -> list[
     except InputError as error:
         return [Finding("angles", "red" if needed else "amber", f"{session.info_path}: {error}.")]
     step, frames = info.nominal_step_deg, {frame.name for frame in session.frames}
-    gaps = [name for name in session.turn[places[0] : places[-1]] if name not in frames]
-    if step is None or info.frame_angles_deg is not None or not gaps:
+    if step is None or not are_assumed(info, places):
         return []
+    gaps = [name for name in session.turn[places[0] : places[-1]] if name not in frames]
     sentence = (
         f"The table is taken to have turned by a nominal step for {names_in_short(gaps)}, too, left out between "
         f"{session.frames[0].name} and {session.frames[-1].name}; if it did not, give frame_angles_deg."
@@ -200,7 +210,9 @@ def check_angles(session: Session, poses: PoseMethod, markers: Markers) -> list[
     values = dict(
         zip([frame.name for frame in session.frames], [step * (p - places[0]) for p in places], strict=True)
     )
-    return [Finding("angles", "amber" if needed or poses == "colmap" else "green", sentence, values)]
+    # Held angles are measured by nothing; features measure them otherwise, and markers do without them.
+    level: Level = "red" if poses == "angles" else "amber" if needed or poses == "colmap" else "green"
+    return [Finding("angles", level, sentence, values)]
 
 
 def draw_inspection(inspection: Inspection, path: Path) -> None:

@@ -51,6 +51,12 @@ def required_angles_deg(info: SessionInfo, places: Sequence[int]) -> Float[np.nd
     return angles_deg
 
 
+def are_assumed(info: SessionInfo, places: Sequence[int]) -> bool:
+    """Whether the known angles rest on the assumption that the table turned for captures that are left out."""
+    has_gaps = places[-1] - places[0] >= len(places)
+    return has_gaps and info.nominal_step_deg is not None and info.frame_angles_deg is None
+
+
 def _turned_deg(scale_deg: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     """By how much the table has turned since the first frame, positive, by the readings of a scale of 360 degrees.
 
@@ -76,7 +82,8 @@ def step_deviation_deg(poses: TurntablePoses, info: SessionInfo, places: Sequenc
 
 
 def check_angles(poses: TurntablePoses, info: SessionInfo, places: Sequence[int]) -> list[Finding]:
-    """Whether the poses contradict the direction, the angles or the nominal step of ``session.json``."""
+    """Whether the poses contradict the direction, the angles or the nominal step of ``session.json``, or are held at
+    angles that nothing measured."""
     found = []
     steps = np.diff(poses.angles_deg[poses.used]) / np.diff(np.array(places)[poses.used])
     median = float(np.median(steps))
@@ -102,6 +109,20 @@ def check_angles(poses: TurntablePoses, info: SessionInfo, places: Sequence[int]
     nominal, deviation = info.nominal_step_deg, step_deviation_deg(poses, info, places)
     if nominal is None or deviation is None:
         return found
+    if are_assumed(info, places):
+        if poses.method == "angles":
+            sentence = (
+                "The poses are held at angles that count a nominal step for each capture that is left out; give "
+                "frame_angles_deg, of the frames."
+            )
+            return [*found, Finding("angles", "red", sentence, {"nominal_step_deg": nominal})]
+        without_gaps = step_deviation_deg(poses, info, range(len(places)))
+        if without_gaps is not None and without_gaps <= _ANGLE_TOLERANCE * nominal < deviation:
+            sentence = (
+                "The angles show that the table did not turn for the captures that are left out; for poses without "
+                "markers, give frame_angles_deg of the frames."
+            )
+            return [*found, Finding("poses-angles", "amber", sentence, {"largest_deviation_deg": deviation})]
     values = {"nominal_step_deg": nominal, "median_step_deg": abs(median), "largest_deviation_deg": deviation}
     if abs(abs(median) - nominal) > _STEP_TOLERANCE * nominal:
         sentence = (

@@ -1,4 +1,5 @@
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -147,6 +148,28 @@ def test_a_capture_that_is_left_out_keeps_its_place_in_the_turn(tmp_path, specim
     assert session.info.frame_angles_deg == tuple(angles_deg[place] for place in places)
     (tmp_path / "session.json").write_text(json.dumps({"frame_angles_deg": [0.5] * len(names)}))
     assert open_session(tmp_path, **left_out).info.frame_angles_deg == (0.5,) * len(names)
+
+
+@pytest.mark.parametrize("specim", [True, False])
+def test_the_table_did_not_turn_for_a_copy_that_is_left_out(tmp_path, specim):
+    write_session(tmp_path, specim=specim, info={**INFO, "frame_angles_deg": [0, 90, 180, 270]})
+    copy = "ball_2 - Copy"
+    for file in list(tmp_path.rglob("*ball_2.*")):
+        to = tmp_path / copy / "capture" if specim else tmp_path
+        to.mkdir(parents=True, exist_ok=True)
+        shutil.copy(file, to / file.name.replace("ball_2", copy))
+    assert open_session(tmp_path).places == (0, 1, 2, 3, 4)
+    for left_out, names, places in (
+        ([copy], ["ball_1", "ball_2", "ball_3", "ball_4"], (0, 1, 2, 3)),
+        (["ball_2"], ["ball_1", copy, "ball_3", "ball_4"], (0, 1, 2, 3)),
+        (["ball_2", copy], ["ball_1", "ball_3", "ball_4"], (0, 2, 3)),
+    ):
+        session = open_session(tmp_path, exclude=left_out)
+        assert ([frame.name for frame in session.frames], session.places) == (names, places)
+        assert session.info.frame_angles_deg == tuple(90.0 * place for place in places)
+    # One angle of each capture, the copy's too.
+    (tmp_path / "session.json").write_text(json.dumps({**INFO, "frame_angles_deg": [0, 90, 90, 180, 270]}))
+    assert open_session(tmp_path, exclude=[copy]).info.frame_angles_deg == (0.0, 90.0, 180.0, 270.0)
 
 
 def test_a_damaged_white_is_not_left_out(tmp_path):

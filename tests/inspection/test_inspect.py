@@ -21,10 +21,12 @@ from inspection_session import (
 )
 
 from hsi_sc_nerf.capture.envi import open_cube, write_cube
-from hsi_sc_nerf.capture.session import open_session
+from hsi_sc_nerf.capture.session import Session, open_session
+from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.inspection.capture_checks import acquisition_day, check_frames
-from hsi_sc_nerf.inspection.inspect import Inspection, draw_inspection, inspect_session, is_named
+from hsi_sc_nerf.inspection.inspect import Inspection, draw_inspection, filled_in, inspect_session, is_named
+from hsi_sc_nerf.inspection.marker_checks import Markers
 
 
 def inspect(path: Path) -> tuple[Inspection, dict[str, Finding]]:
@@ -195,7 +197,8 @@ def test_angles_that_poses_need_are_asked_for_before_any_computing(session, stat
 @pytest.mark.parametrize(
     ("name", "stated", "poses", "level"),
     [
-        ("fruit_05", {"nominal_step_deg": 30}, "angles", "amber"),
+        ("fruit_05", {"nominal_step_deg": 30}, "angles", "red"),
+        ("fruit_05", {"nominal_step_deg": 30}, "colmap", "amber"),
         ("fruit_05", {"nominal_step_deg": 30}, "auto", "green"),
         ("fruit_05", {"frame_angles_deg": list(range(0, 360, 30))}, "angles", None),
         ("fruit_11", {"nominal_step_deg": 30}, "angles", None),
@@ -225,6 +228,26 @@ def test_without_session_json_it_is_written_for_the_user(good, tmp_path):
         "direction": "ccw",
     }
     assert inspect_session(open_session(session), poses="colmap").findings[-1].level == "amber"
+
+
+@pytest.mark.parametrize(
+    ("captures", "left_out", "turned_deg", "nominal_deg"),
+    [
+        (60, [30], [6.01 * place for place in range(60)], 6.0),
+        (60, [0, 59], [5.99 * place for place in range(60)], 6.0),
+        (60, range(1, 60, 2), [6.01 * place for place in range(60)], 6.0),
+        (61, [30], [6.01 * (place - (place > 30)) for place in range(61)], 6.0),  # the table did not turn for it
+        (20, [10], [6.01 * place for place in range(20)], 6.0),
+        (60, [], [6.01 * place for place in range(60)], 6.0),
+    ],
+)
+def test_a_whole_turn_counts_captures_that_are_left_out(tmp_path, captures, left_out, turned_deg, nominal_deg):
+    turn = tuple(f"fruit_{place:02d}" for place in range(captures))
+    kept = [place for place in range(captures) if place not in left_out]
+    frames = tuple(SimpleNamespace(name=turn[place]) for place in kept)
+    markers = Markers("DICT_5X5_50", [{}] * len(kept), np.array(turned_deg)[kept], 0, 20.0, 0.1)
+    content = filled_in(Session(tmp_path, SessionInfo(), None, frames, turn=turn), markers)
+    assert (content["nominal_step_deg"], content["direction"]) == (nominal_deg, "ccw")
 
 
 @pytest.mark.parametrize("quarter_turns", [0, 3])

@@ -50,6 +50,26 @@ def test_places_of_captures_that_are_left_out_count():
 
 
 @pytest.mark.parametrize(
+    ("places", "method", "expected"),
+    [
+        ((0, 1, 3, 4), "colmap", {"poses-angles": "amber"}),
+        ((0, 2, 4, 6), "markers", {"poses-angles": "amber"}),
+        ((0, 1, 3, 4), "angles", {"angles": "red"}),
+        ((4, 5, 6, 7), "angles", {}),
+    ],
+)
+def test_a_table_that_did_not_turn_for_a_capture_that_is_left_out(places, method, expected):
+    """A retake at the same angle; poses at held angles do not show it."""
+    poses = replace(GOOD, method=method)
+    if method == "angles":
+        poses = replace(poses, angles_deg=90.0 * (np.array(places) - places[0]))
+    found = check_poses(poses, STEPS, places)
+    assert {finding.name: finding.level for finding in found} == expected
+    assert all("frame_angles_deg" in finding.sentence for finding in found)
+    assert check_poses(poses, replace(STEPS, nominal_step_deg=None), places) == []
+
+
+@pytest.mark.parametrize(
     ("poses", "info", "expected"),
     [
         (GOOD, STEPS, {}),
