@@ -61,8 +61,8 @@ def read_number_table(path: Path, columns: int | None = None, blanks: Collection
     and so are empty columns without a title at the right, which spreadsheets leave.
 
     Args:
-        columns: read so many from the left; the others may hold anything, but not what may be the decimals of these:
-            digits after commas, without titles and without a point in the table.
+        columns: read so many from the left; the others may hold anything and be missing, but not what may be the
+            decimals of these: digits after a comma where titles do not tell, if no number of the table has a point.
         blanks: words, in lower case, that stand for no number, as NA does.
 
     Raises:
@@ -93,21 +93,32 @@ def read_number_table(path: Path, columns: int | None = None, blanks: Collection
     rows, lines = rows[bool(titles) :], [number for number, _ in numbered[bool(titles) :]]
     rows = [["" if cell.lower() in blanks else cell for cell in row] for row in rows]
     width = len(titles or rows[0])
+    if columns is not None:
+        if separator == "," and _may_be_decimals(rows, len(titles) or columns, columns):
+            raise ValueError(f"its commas may separate columns or be decimal marks; {_COMMAS}")
+        width = min(width, columns)
+        titles, rows = titles[:width], [row[:width] for row in rows]
     for number, row in zip(lines, rows, strict=True):
         if len(row) != width:
             raise ValueError(
                 f"its lines do not have the same number of columns: line {number} has {len(row)} and not {width}; "
                 f"{_COMMAS}"
             )
-        for cell in row[:columns]:
+        for cell in row:
             if not _is_number(cell):
                 raise ValueError(f"line {number}: {cell!r} is not a number")
-    if columns is not None and width > columns:
-        if separator == "," and not titles and all(cell.isdecimal() for row in rows for cell in row):
-            raise ValueError(f"its commas may separate columns or be decimal marks; {_COMMAS}")
-        titles, rows, width = titles[:columns], [row[:columns] for row in rows], columns
     table = np.array([[number_in(cell) for cell in row] for row in rows], float).reshape(len(rows), width)
     return NumberTable(notes, titles, table, tuple(lines))
+
+
+def _may_be_decimals(rows: Sequence[list[str]], named: int, columns: int) -> bool:
+    """Whether the comma after the first columns may be a decimal mark.
+
+    Rows are longer than what is named, with a digit there, and no number shows how decimals are written.
+    """
+    longer = any(len(row) > named and row[columns][:1].isdecimal() for row in rows)
+    marked = any(mark in cell for row in rows for cell in row if _is_number(cell) for mark in ".,")
+    return longer and not marked
 
 
 def number_in(text: str) -> float:

@@ -92,6 +92,27 @@ def test_a_single_column_with_decimal_commas_is_not_cut(tmp_path, title):
     np.testing.assert_allclose(read_band_centres(quoted), [397.32, 400.20, 403.09])
 
 
+@pytest.mark.parametrize(
+    ("text", "centres_nm"),
+    [
+        ("wavelength_nm,fwhm,comment\n397.3,7\n400.2,7,first\n", [397.3, 400.2]),
+        ("wavelength_nm,note\n397.3\n400.2,see a, b\n", [397.3, 400.2]),
+        ("wavelength_nm,note\n397,\n400,see a, 2\n", [397.0, 400.0]),
+        ("wavelength_nm,fwhm\n397,7.5\n400,7,5\n", [397.0, 400.0]),
+        ("397.3,7,a\n400.2\n", [397.3, 400.2]),
+        ("nm;Anmerkung\n397,3\n400,2;siehe a; b\n", [397.3, 400.2]),
+    ],
+)
+def test_columns_beside_band_centres_hold_anything(tmp_path, text, centres_nm):
+    np.testing.assert_array_equal(read_band_centres(write(tmp_path, text)), centres_nm)
+
+
+@pytest.mark.parametrize("text", ["nm,note\n397,3\n400,2,b\n", "nm\n397\n400,2 nm\n", "397,3,a\n400,2,b\n"])
+def test_digits_that_may_be_decimals_are_not_cut(tmp_path, text):
+    with pytest.raises(InputError, match=r"own\.csv: .*decimal commas"):
+        read_band_centres(write(tmp_path, text))
+
+
 @pytest.mark.parametrize("text", ["nm,band\n400,1\n403,2\n", "400,1.5\n403,1.5\n", "400;1\n403;2\n", "400\n403\n"])
 def test_columns_beside_whole_band_centres(tmp_path, text):
     np.testing.assert_array_equal(read_band_centres(write(tmp_path, text)), [400.0, 403.0])
