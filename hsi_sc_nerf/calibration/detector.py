@@ -24,6 +24,8 @@ LEAST_BRIGHTNESS = 0.02
 """A sample darker than this fraction of its neighbours in all bands is dead, and not in a shadow."""
 CERTAINTY = 6.0
 """Differences count from this many standard deviations, which noise reaches in none of 10^8 elements."""
+REACHED_BY_NOISE = 3.0
+"""Noise reaches counts up to this many standard deviations away, in about one of 10^3 readings."""
 DEAD_BAND_FRACTION = 0.5
 """A band with a larger fraction of dead elements is bad."""
 MIN_LIGHT = 0.001
@@ -165,12 +167,30 @@ def unlit_bands(light: Float[np.ndarray, "columns bands"]) -> Bool[np.ndarray, "
 
 
 def dark_counts(dark: Cube | None) -> Num[np.ndarray, "dark_lines dark_samples bands"] | None:
-    """Counts of a dark cube, NaN for no data; None without one."""
+    """Counts of a dark cube, NaN for no data; None without one.
+
+    Many headers state 0 as ``data ignore value``; a dark cube may read 0, and then it is a count.
+    """
     if dark is None:
         return None
-    counts = dark.memmap()
-    missing = no_data(counts, dark.ignore_value)
+    counts, ignored = dark.memmap(), dark.ignore_value
+    missing = no_data(counts, ignored)
+    if missing is not None and ignored == 0 and _is_dark(counts[spread_rows(len(counts), SOME_LINES)]):
+        missing = no_data(counts, None)
     return counts if missing is None else np.where(missing, np.nan, counts)
+
+
+def _is_dark(counts: Num[np.ndarray, "dark_lines dark_samples bands"]) -> bool:
+    """Whether the count 0 is a reading of a dark cube like the others: noise reaches it, or there are no others."""
+    readings = np.nan_to_num(counts, posinf=0.0, neginf=0.0).astype(np.float32)
+    others = readings[readings != 0.0]
+    if not len(others):
+        return True
+    level = float(np.median(others))
+    # A pattern of the elements is no noise, but of one line all that there is.
+    changes = np.diff(readings, axis=0) / np.sqrt(2.0) if len(readings) > 1 else others - level
+    rounding = 1.0 if (others == np.rint(others)).all() else 0.0
+    return abs(level) <= rounding + REACHED_BY_NOISE * float(robust_std(changes))
 
 
 def dark_columns(

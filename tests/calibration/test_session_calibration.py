@@ -281,3 +281,16 @@ def test_an_element_without_dark_counts_is_dead_and_not_without_an_offset(tmp_pa
     assert found.bands.tolist() == [band for band in range(BANDS) if band != 9]
     np.testing.assert_allclose(found.frames[0].dark[:, found.bands], DARK)
     np.testing.assert_allclose(found.frames[0].gain[0, found.bands], 1.0 / LAMP[found.bands], rtol=1e-3)
+
+
+@pytest.mark.parametrize(("lines", "offset", "noise"), [(2, 0.0, 0.0), (1, 1.0, 1.0), (8, 2.0, 1.0), (8, -3.0, 1.0)])
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+def test_a_dark_of_zeros_has_data_though_its_header_says_none(tmp_path, lines, offset, noise, dtype):
+    rng = np.random.default_rng(0)
+    for header in [*write_session(tmp_path).rglob("DARKREF_*.hdr")]:
+        dark = np.clip(np.rint(rng.normal(offset, noise, (lines, SIZE_PX, BANDS))), 0, None).astype(dtype)
+        write_cube(header, dark, wavelengths_nm=WAVELENGTHS_NM, extra_header={"data ignore value": 0})
+    found = calibrate_session(open_session(tmp_path), CalibrationConfig())
+    assert not found.defects.dead.any()
+    assert len(found.bands) == BANDS
+    np.testing.assert_allclose(found.frames[-1].dark, dark.mean(axis=0))
