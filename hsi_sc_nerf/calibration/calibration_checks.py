@@ -322,8 +322,9 @@ def _check_noise(session: Session, calibration: SessionCalibration) -> Finding:
     spectrum = white.mean_spectrum()[bands]
     snr = float(np.median(spectrum / np.sqrt(noise.read_noise[bands] ** 2 + noise.counts_per_electron * spectrum)))
     scatter = 0.0 if isinstance(drift, NotMeasurable) else drift.scatter
-    values = {"signal_to_noise_of_white": snr, "scatter_of_wall": scatter}
-    text = f"one pixel of the white has a signal-to-noise ratio of {snr:.0f}"
+    measured = noise.read_noise_measured and noise.photon_noise_measured
+    values = {"signal_to_noise_of_white": snr if measured else None, "scatter_of_wall": scatter}
+    text = f"one pixel of the white has a signal-to-noise ratio of {'' if measured else 'at most '}{snr:.0f}"
     if snr < LOW_SNR:
         level: Level = "red" if snr < USELESS_SNR else "amber"
         return Finding("noise", level, f"{session.path}: {text}; use more light or a longer exposure.", values)
@@ -332,7 +333,7 @@ def _check_noise(session: Session, calibration: SessionCalibration) -> Finding:
             f"the stationary wall scatters by {100.0 * scatter:.1f} % from frame to frame; check lamps and shadows."
         )
         return Finding("noise", "amber", f"{session.path}: {sentence}", values)
-    if not (noise.read_noise_measured and noise.photon_noise_measured):
+    if not measured:
         unknown = {"read noise": noise.read_noise_measured, "photon noise": noise.photon_noise_measured}
         what = " and the ".join(name for name, measured in unknown.items() if not measured)
         sentence = f"the {what} could not be measured, so no uncertainty is stated and the spectra tell the noise"

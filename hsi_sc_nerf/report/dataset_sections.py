@@ -136,8 +136,11 @@ def _calibration_table(dataset: PackedDataset, found: Mapping[str, Any]) -> Tabl
         ("values that are no measurement", f"{dataset.flagged_values} ({100.0 * fraction:.3f} %)"),
     ]
     if noise:
-        rows.append(("read noise, median over bands", f"{np.median(noise['read_noise_counts']):.2f} counts"))
-        rows.append(("counts per photo-electron", f"{noise['counts_per_electron']:.3f}"))
+        read, photon = f"{np.median(noise['read_noise_counts']):.2f} counts", f"{noise['counts_per_electron']:.3f}"
+        rows += [
+            ("read noise, median over bands", read if noise.get("read_noise_measured", True) else "not measured"),
+            ("counts per photo-electron", photon if noise.get("photon_noise_measured", True) else "not measured"),
+        ]
     rows.append(("drift of the lamps", _drift_text(found.get("lamp_drift") or {})))
     return Table("Calibration from counts to reflectance.", ("", "found"), rows)
 

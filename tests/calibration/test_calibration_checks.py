@@ -23,12 +23,16 @@ def calibrated(tmp_path_factory):
     return session, calibrate_session(session, CalibrationConfig())
 
 
-def level_of(name, calibrated, **changes):
+def finding_of(name, calibrated, **changes):
     session, calibration = calibrated
     findings = {finding.name: finding for finding in check_calibration(session, replace(calibration, **changes))}
     assert list(findings) == ["drift", "noise"]
     assert all(finding.sentence.count(". ") == 0 for finding in findings.values())
-    return findings[name].level
+    return findings[name]
+
+
+def level_of(name, calibrated, **changes):
+    return finding_of(name, calibrated, **changes).level
 
 
 def drift(change=0.05, error=0.001, scatter=0.003):
@@ -83,7 +87,9 @@ def test_clipped(calibrated, clipped, saturated, level):
 )
 def test_noise(calibrated, slope, measured, scatter, level):
     noise = NoiseModel(np.full(BANDS, 2.0), slope, measured, True)
-    assert level_of("noise", calibrated, noise=noise, drift=drift(scatter=scatter)) == level
+    finding = finding_of("noise", calibrated, noise=noise, drift=drift(scatter=scatter))
+    assert finding.level == level
+    assert (finding.values["signal_to_noise_of_white"] is not None) == measured
     assert level_of("noise", calibrated, noise=None, white=None) == "green"
 
 

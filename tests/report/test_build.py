@@ -90,6 +90,17 @@ def test_sections_on_a_processed_session(flagged_dataset):
     assert len(Page(text).all("svg")) >= 4
 
 
+@pytest.mark.parametrize(("read", "photon"), [(True, True), (True, False), (False, False)])
+def test_noise_that_was_not_measured_has_no_figure(tmp_path, read, photon):
+    dataset = open_packed(ball_run.write_ball_dataset(tmp_path / "ball"))
+    noise = {"read_noise_counts": [0.29], "counts_per_electron": 0.0}
+    measured = {"read_noise_measured": read, "photon_noise_measured": photon}
+    write_json(dataset.root / "calibration.json", {"noise": noise | measured})
+    rows = dict(calibration_section(dataset).blocks[0].rows)
+    for name, known in (("read noise, median over bands", read), ("counts per photo-electron", photon)):
+        assert any(letter.isdigit() for letter in rows[name]) == known
+
+
 def test_files_that_are_something_else_are_refused_and_nothing_is_written(run, tmp_path):
     (tmp_path / "report").mkdir()
     (tmp_path / "report" / "inspection.json").write_text('{"findings": ["white"]}')
