@@ -27,7 +27,8 @@ from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.packed.dataset import PackedDataset, open_packed, transforms_path
 from hsi_sc_nerf.processing.painted_masks import painted_box, with_object_box
-from hsi_sc_nerf.processing.process import ProcessConfig, process_session
+from hsi_sc_nerf.processing.process import ProcessConfig, is_processed, process_session
+from hsi_sc_nerf.processing.visual_hull import size_in_words
 from hsi_sc_nerf.spectra import nearest_bands
 from hsi_sc_nerf.terminal import ignore_library_warnings
 
@@ -166,26 +167,21 @@ def require_data(manager: Any) -> None:
             export use as well, whatever becomes of the dataset.
 
     Raises:
-        InputError: they are neither, or a dataset that cannot be read.
+        InputError: they are neither, or a dataset that cannot be read, or a session that cannot be used.
     """
     data = manager.data or manager.dataparser.data
-    dataset = _processed_before(data) if is_unprocessed(data) else open_packed(data)
+    dataset: PackedDataset | None = None
+    if not is_unprocessed(data):
+        dataset = open_packed(data)
+    # Of a dataset that is made anew, masks, poses and scale are others.
+    elif is_processed(data, made := processed_dir(data.resolve()), manager.dataparser.process):
+        dataset = open_packed(made)
     box_m = None if dataset is None else painted_box(dataset)
     found = None if box_m is None else tuple(map(tuple, box_m.tolist()))
     if dataset is not None and box_m is not None and found != manager.dataparser.object_box_m:
-        size_mm = " x ".join(f"{1000.0 * side:.0f}" for side in np.diff(box_m, axis=0)[0])
-        CONSOLE.print(
-            f"{dataset.root}: painted masks show more; the box of the object is {size_mm} mm.", markup=False
-        )
+        size = size_in_words(box_m, dataset.metric)
+        CONSOLE.print(f"{dataset.root}: painted masks show more; the box of the object is {size}.", markup=False)
     manager.dataparser.object_box_m = found
-
-
-def _processed_before(session_dir: Path) -> PackedDataset | None:
-    """The dataset of a session; None if it is to be made, or made again."""
-    try:
-        return open_packed(processed_dir(session_dir.resolve()))
-    except InputError:
-        return None
 
 
 def is_unprocessed(data: Path) -> bool:

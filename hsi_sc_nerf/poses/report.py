@@ -81,7 +81,8 @@ def _check_uncertainty(poses: TurntablePoses) -> list[Finding]:
             advice.append("give --camera, an earlier dataset of the same camera")
     sentence = f"The poses are known to {known[0]:.2g} degrees and {place}, {scale}"
     sentence += "." if level == "green" else f"; {', or '.join(advice)}."
-    values = {"rotation_deg": known[0], "position_mm": known[1], "scale_percent": percent}
+    position_mm = known[1] if poses.metric else None
+    values = {"rotation_deg": known[0], "position_mm": position_mm, "scale_percent": percent}
     return [Finding("poses-uncertain", level, sentence, values)]
 
 
@@ -300,7 +301,7 @@ def _uncertainty(poses: TurntablePoses) -> dict | None:
         "focal_percent": 100.0 * sigma.focal,
         "distance_percent": 100.0 * sigma.distance,
         "rotation_deg": sigma.rotation_deg,
-        "position_mm": 1e3 * sigma.position_m,
+        "position_mm": 1e3 * sigma.position_m if poses.metric else None,
         "angles_deg": _by_name(poses, sigma.angle_deg),
     }
 

@@ -36,18 +36,20 @@ from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.processing.appearance_checks import check_appearance, check_band_order
 from hsi_sc_nerf.processing.chamber import background_spectrum
 from hsi_sc_nerf.processing.effects import draw_effects, measure_effects, points_of_object, show_effects
-from hsi_sc_nerf.processing.frames import (
-    BinsOfFrames,
-    FrameCache,
-    pack_frames,
-    session_fingerprint,
-)
+from hsi_sc_nerf.processing.frames import BinsOfFrames, FrameCache, is_up_to_date, pack_frames, session_fingerprint
 from hsi_sc_nerf.processing.mask_checks import check_masks
 from hsi_sc_nerf.processing.masks import MaskConfig, above_lid, foreground_masks, lid_middle, mask_picture
 from hsi_sc_nerf.processing.painted_masks import note_masks
 from hsi_sc_nerf.processing.posed_frames import PoseFunction, container_under, known_camera, pose_frames, posed_frames
 from hsi_sc_nerf.processing.session_checks import SessionChecks, require_checks
-from hsi_sc_nerf.processing.visual_hull import VotedHull, assumed_disc, object_box, scene_box, voted_hull
+from hsi_sc_nerf.processing.visual_hull import (
+    VotedHull,
+    assumed_disc,
+    object_box,
+    scene_box,
+    size_in_words,
+    voted_hull,
+)
 from hsi_sc_nerf.settings_file import between, check_options
 from hsi_sc_nerf.spectra import nearest_bands
 
@@ -123,9 +125,8 @@ def process_session(
     console = Console(stderr=True, quiet=not progress, markup=False, emoji=False)
 
     session = open_session(session_dir, exclude=config.exclude, skip_damaged=config.skip_damaged)
-    named = [] if config.camera is None else [transforms_path(config.camera)]
-    fingerprint = session_fingerprint(session, config, named)
-    if _is_up_to_date(output_dir, fingerprint):
+    fingerprint = _fingerprint(session, config)
+    if is_up_to_date(output_dir, fingerprint):
         console.print(f"{output_dir}: is up to date.")
         return output_dir
     camera = None if config.camera is None else known_camera(open_packed(config.camera))
@@ -221,13 +222,18 @@ def _inspect(
     return inspection.session, SessionChecks(inspection, config.accept, output_dir)
 
 
-def _is_up_to_date(output_dir: Path, fingerprint: str) -> bool:
-    if not is_packed(output_dir):
-        return False
-    try:
-        return open_packed(output_dir).fingerprint == fingerprint
-    except InputError:  # an incomplete dataset is made again
-        return False
+def is_processed(session_dir: Path, output_dir: Path, config: ProcessConfig) -> bool:
+    """Whether a folder holds the dataset that `process_session` would make there, so that it returns at once.
+
+    Raises:
+        InputError: the session cannot be used.
+    """
+    session = open_session(session_dir, exclude=config.exclude, skip_damaged=config.skip_damaged)
+    return is_up_to_date(output_dir, _fingerprint(session, config))
+
+
+def _fingerprint(session: Session, config: ProcessConfig) -> str:
+    return session_fingerprint(session, config, [] if config.camera is None else [transforms_path(config.camera)])
 
 
 def _remove_transforms(output_dir: Path) -> None:
@@ -333,9 +339,7 @@ def _boxes(
 ) -> tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "2 3"]]:
     """The boxes of the object and of everything that turns; print what is assumed for them."""
     object_box_m = object_box(hull, None if container is None else container.height_m)
-    factor, unit = (1000.0, "mm") if poses.metric else (100.0, "% of the camera's distance")
-    size = " x ".join(f"{factor * side:.0f}" for side in np.diff(object_box_m, axis=0)[0])
-    console.print(f"Object: inside a box of {size} {unit}.")
+    console.print(f"Object: inside a box of {size_in_words(object_box_m, poses.metric)}.")
     diameter_m = session.info.container_diameter_m if poses.metric else None
     if assumption := assumed_disc(bool(poses.marker_corners_m), diameter_m):
         console.print(f"Scene: {assumption}.", highlight=False)

@@ -203,6 +203,12 @@ def object_box(hull: VotedHull, min_z_m: float | None = None) -> Float[np.ndarra
     return box
 
 
+def size_in_words(box_m: Float[np.ndarray, "2 3"], metric: bool) -> str:
+    """The sides of a box: in mm, or in % of the camera's distance where nothing gives the scale."""
+    factor, unit = (1000.0, "mm") if metric else (100.0, "% of the camera's distance")
+    return f"{' x '.join(f'{factor * side:.0f}' for side in np.diff(box_m, axis=0)[0])} {unit}"
+
+
 def scene_box(
     object_box_m: Float[np.ndarray, "2 3"],
     marker_corners_m: dict[int, Float[np.ndarray, "4 3"]],

@@ -1,20 +1,30 @@
 """How frames are divided between training and evaluation, where the scene lies for the model, what an item holds."""
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from ball_run import write_ball_dataset
+from capture_factory import write_session
 from painted_stem import paint_stem
 
+from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.config import hsi_sc_nerf
 from hsi_sc_nerf.data.datamanager import SpectralDataset
-from hsi_sc_nerf.data.dataparser import SpectralDataParserConfig, scene_scaling, split_frames
+from hsi_sc_nerf.data.dataparser import (
+    SpectralDataParserConfig,
+    processed_dir,
+    require_data,
+    scene_scaling,
+    split_frames,
+)
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.models.run_settings import read_config
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE
-from hsi_sc_nerf.packed.dataset import open_packed
+from hsi_sc_nerf.packed.dataset import open_packed, write_transforms
+from hsi_sc_nerf.processing.frames import session_fingerprint
 from hsi_sc_nerf.processing.painted_masks import note_masks
 
 
@@ -79,6 +89,23 @@ def test_what_painted_masks_add_is_inside_the_boxes_of_the_run_alone(tmp_path):
     note_masks(processed)
     config.save_config()
     assert config.pipeline.datamanager.dataparser.object_box_m is None
+
+
+def test_painted_masks_of_a_dataset_that_is_made_anew_have_no_box(tmp_path, capsys):
+    """The session has changed since: masks, poses and scale will be others."""
+    session_dir, config = write_session(tmp_path / "s"), copy.deepcopy(hsi_sc_nerf.config)
+    manager = config.pipeline.datamanager
+    manager.data = manager.dataparser.data = session_dir
+    fingerprint = session_fingerprint(open_session(session_dir), manager.dataparser.process)
+    dataset = open_packed(write_ball_dataset(processed_dir(session_dir)))
+    write_transforms(replace(dataset, fingerprint=fingerprint, metric=False))
+    top_m = paint_stem(dataset)
+    require_data(manager)
+    assert manager.dataparser.object_box_m[1][2] > top_m
+    assert " mm" not in capsys.readouterr().out  # nothing gives the scale
+    (session_dir / "session.json").write_text('{"object": "pear"}')
+    require_data(manager)
+    assert manager.dataparser.object_box_m is None
 
 
 def test_the_scene_fills_the_models_cube():

@@ -37,6 +37,9 @@ def test_uncertain_poses_come_with_advice_that_can_help(poses, advice, percent):
     (finding,) = [finding for finding in check_poses(poses, SessionInfo()) if finding.name == "poses-uncertain"]
     assert finding.level == "amber"
     assert finding.values["scale_percent"] == percent
+    report = pose_report(poses, SessionInfo())
+    for position_mm in (finding.values["position_mm"], report["uncertainty"]["position_mm"]):
+        assert position_mm == (pytest.approx(0.4) if poses.metric else None)
     told = finding.sentence.split("; ", 1)[1]
     assert [word for word in ("marker_side_m", "markers", "--camera") if word in told] == advice
     assert ("not known" in finding.sentence) == (percent is None)
