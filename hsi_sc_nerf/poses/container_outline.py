@@ -52,6 +52,8 @@ class ContainerOutline:
     foot: float
     """Height of the container's foot, which stands on the disc, in the turntable frame."""
     foot_sigma: float
+    height: float
+    """Height of the lid over the foot, by the stated proportions."""
 
 
 def container_outline(
@@ -107,7 +109,8 @@ def container_outline(
     errors = np.hypot(scatter / np.sqrt(len(found)), [edge, edge / in_image])
     # A higher container is nearer to a camera that looks down, and appears wider.
     nearer = looks[2] / depth * errors[1]
-    return ContainerOutline(radius, float(np.hypot(errors[0] / radius, nearer)), foot, float(errors[1]))
+    height = 2.0 * radius * height_over_diameter
+    return ContainerOutline(radius, float(np.hypot(errors[0] / radius, nearer)), foot, float(errors[1]), height)
 
 
 def radius_by_camera(outline: ContainerOutline, turntable: Turntable) -> Float[np.ndarray, "5"]:

@@ -71,6 +71,17 @@ def disc_height(turntable: Turntable) -> float:
     return float(np.percentile(turntable.points_3d[:, 2], _LOWEST_POINTS_PERCENTILE))
 
 
+def foot_gives_disc(turntable: Turntable, outline: ContainerOutline | None) -> bool:
+    """Whether the disc's height is that of the container's foot, which is known to about a pixel.
+
+    Markers on the disc tell it better. Those that lie nearer to the container's lid than to its foot are on the lid.
+    """
+    if outline is None:
+        return False
+    near = abs(disc_height(turntable) - outline.foot) < 0.5 * outline.height
+    return not (lie_on_disc(turntable.corners()).any() and near)
+
+
 def lowest_landmarks(turntable: Turntable) -> Bool[np.ndarray, "l"]:
     """Which markers, or without any which points, the disc's height rests on."""
     if len(turntable.markers) == 0:

@@ -18,6 +18,7 @@ from hsi_sc_nerf.poses.object_frame import (
     container_diameter,
     disc_height,
     disc_tilt_deg,
+    foot_gives_disc,
     lie_on_disc,
     lowest_landmarks,
     scale_of,
@@ -49,12 +50,14 @@ def in_object_frame(
 
     Args:
         adjusted: in any unit of length.
-        outline: outline of the container in the same unit, which gives the disc's height.
+        outline: outline of the container in the same unit, which gives the disc's height where no marker does.
         specific: what the method itself knows for ``TurntablePoses``.
     """
     source, metres = scale_of(adjusted.turntable, info, outline)
     turntable, n = adjusted.turntable.resized(metres), len(names)
-    to_object = to_object_frame(turntable, disc_height(turntable) if outline is None else metres * outline.foot)
+    by_foot = foot_gives_disc(adjusted.turntable, outline)
+    disc = disc_height(turntable) if outline is None or not by_foot else metres * outline.foot
+    to_object = to_object_frame(turntable, disc)
     corners = turntable.corners() @ to_object[:3, :3].T + to_object[:3, 3]
     on_disc, motion = lie_on_disc(turntable.corners()), turntable.motion
     uncertainty = pose_uncertainty(adjusted, adjusted.covariance(), metres, outline)
@@ -67,7 +70,7 @@ def in_object_frame(
         used=np.isin(np.arange(n), turntable.frames),
         marker_corners_m={int(m): c for m, c in zip(turntable.markers, corners, strict=True)},
         disc_markers=tuple(turntable.markers[on_disc].tolist()),
-        disc_by_container=outline is not None,
+        disc_by_container=by_foot,
         disc_tilt_deg=disc_tilt_deg(turntable),
         model="turntable" if motion is None else "free poses",
         wobble_deg=None if motion is None else float(np.rad2deg(np.sqrt((motion[:, :2] ** 2).sum(-1).mean()))),
@@ -117,7 +120,8 @@ def pose_uncertainty(
     Args:
         covariance: covariance of its parameters (``Adjusted.covariance``).
         metres: length of its unit.
-        outline: outline of the container, where its radius gives the scale and its foot the disc's height.
+        outline: outline of the container, where its radius gives the scale; its foot gives the disc's height where no
+            marker does.
     """
     layout, turntable = adjusted.problem.layout, adjusted.turntable
     sigmas = np.sqrt(covariance.diagonal())
@@ -132,9 +136,11 @@ def pose_uncertainty(
     # The camera over the disc: its distance from the axis, its height, and its arc along the circle from the first
     # frame's. And the size of the object.
     height, size = _landmark_gradients(adjusted)
-    radius, radius_variance = np.zeros_like(size), 0.0
+    radius, radius_variance, by_foot = np.zeros_like(size), 0.0, foot_gives_disc(turntable, outline)
     if outline is not None:
-        height, radius_variance = _foot_gradient(adjusted, outline), outline.radius_sigma**2
+        if by_foot:
+            height = _foot_gradient(adjusted, outline)
+        radius_variance = outline.radius_sigma**2
         radius[layout.camera] = radius_by_camera(outline, turntable)[: len(layout.camera)]
     upright_plane = (turntable.distance * camera[:, 4]) ** 2 + (drawn @ height) ** 2
     position = upright_plane[:, None] + (turntable.distance * angles) ** 2
@@ -144,7 +150,7 @@ def pose_uncertainty(
         # The container's size is exact, so an error of its radius in the images is one of the camera's distance.
         distance += float(radius @ covariance @ radius) + radius_variance
         reach_sq = turntable.distance**2 + outline.foot**2
-        variance += metres**2 * (outline.foot_sigma**2 + distance * reach_sq)
+        variance += metres**2 * (by_foot * outline.foot_sigma**2 + distance * reach_sq)
     return Uncertainty(
         focal=float(sigmas[0]),
         distance=float(np.sqrt(distance)),

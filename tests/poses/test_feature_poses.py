@@ -87,6 +87,9 @@ def test_the_outline_gives_the_scale_beside_markers_of_unknown_side(session, sho
         assert np.hypot(*poses.camera_to_world[0, :2, 3]) == pytest.approx(
             scene.first_camera_to_world[0, 3], rel=0.02
         )
+        # The disc is where its markers are, not where the container's foot is seen.
+        assert not poses.disc_by_container
+        assert np.mean([*poses.marker_corners_m.values()], axis=(0, 1))[2] == pytest.approx(0.0, abs=1e-6)
     else:
         assert "container" in told[0]
         assert "show markers" not in told[0]

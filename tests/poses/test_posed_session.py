@@ -10,6 +10,8 @@ from turntable_scene import MarkerScene
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters, Problem
+from hsi_sc_nerf.poses.container_outline import ContainerOutline
+from hsi_sc_nerf.poses.object_frame import disc_height
 from hsi_sc_nerf.poses.posed_session import (
     _landmark_gradients,
     in_object_frame,
@@ -72,6 +74,26 @@ def test_a_scale_by_a_container_whose_markers_may_stand_off_is_stated_as_uncerta
         scale = in_object_frame(adjusted, seen, names, (256, 256), info, **specific).scale
         assert scale.source == source
         assert least <= scale.uncertainty < least + 0.005
+
+
+@pytest.mark.parametrize(
+    ("off_m", "by_foot"), [(0.002, False), (-0.02, False), (-0.07, True)], ids=["disc", "poor foot", "lid"]
+)
+def test_markers_on_the_disc_go_before_the_containers_foot(off_m, by_foot):
+    """Markers that face up nearer to the lid than to the foot lie on the lid."""
+    true = marker_turntable(MarkerScene(size_px=256, frames=12, side_markers=0))
+    adjusted = Adjusted(true, Problem(MarkerResiduals(true, marker_observations(true), 3.0)))
+    specific = {"reprojection_error_px": np.zeros(12), "overall_error_px": 0.0, "markers_per_frame": (3,) * 12}
+    info, disc_m = SessionInfo(container_diameter_m=0.09, container_height_m=0.07), disc_height(true)
+
+    def posed(outline):
+        return in_object_frame(adjusted, None, [f"f{i}" for i in range(12)], (256, 256), info, outline, **specific)
+
+    found, sure = (posed(ContainerOutline(0.045, 0.001, disc_m + off_m, sigma, 0.07)) for sigma in (0.003, 0.0))
+    assert found.disc_by_container == by_foot
+    markers_z_m = np.mean([*found.marker_corners_m.values()], axis=(0, 1))[2]
+    assert markers_z_m == pytest.approx(-off_m if by_foot else 0.0, abs=1e-4)
+    assert (found.uncertainty.position_m > sure.uncertainty.position_m) == by_foot
 
 
 @pytest.mark.parametrize("markers", [False, True])
