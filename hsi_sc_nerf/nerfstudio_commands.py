@@ -28,7 +28,7 @@ from hsi_sc_nerf.data.dataparser import split_frames
 from hsi_sc_nerf.errors import InputError, one_sentence
 from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.models.checkpoints import find_checkpoint, require_model, require_no_others
-from hsi_sc_nerf.models.run_settings import read_config, require_method
+from hsi_sc_nerf.models.run_settings import read_config, relocated_run, require_method
 from hsi_sc_nerf.models.spectral_model import SpectralModelConfig
 from hsi_sc_nerf.packed.dataset import is_packed, open_packed
 
@@ -90,7 +90,7 @@ class _ScriptBeingImported(types.ModuleType):
         return types.ModuleType.__getattribute__(self, name)
 
 
-def _adapted(original: Callable[[Any], None]) -> Callable[[Any], None]:
+def _adapted(original: types.FunctionType) -> Callable[[Any], None]:
     def main(self: Any) -> None:
         with one_sentence():
             if not prepare(self):
@@ -98,7 +98,7 @@ def _adapted(original: Callable[[Any], None]) -> Callable[[Any], None]:
                 original(self)
                 return
             try:
-                with interruption.one_line(), _nothing_half_exported(self):
+                with interruption.one_line(), _nothing_half_exported(self), _opening_moved_runs(original.__globals__):
                     _export_spectral_cloud(self) if type(self).__name__ == "ExportPointCloud" else original(self)
             except OSError as error:
                 if error.filename is None:
@@ -108,6 +108,31 @@ def _adapted(original: Callable[[Any], None]) -> Callable[[Any], None]:
 
     main.__doc__ = original.__doc__
     return main
+
+
+@contextmanager
+def _opening_moved_runs(script: dict[str, Any]) -> Iterator[None]:
+    """Let a script open runs where they lie; nerfstudio takes the paths as they were typed for the training.
+
+    Args:
+        script: what the script's module holds.
+    """
+    opens = script.get("eval_setup")
+
+    def opened(load_config: Path, *, update_config_callback: Any = None, **options: Any) -> Any:
+        def updated(config: Any) -> Any:
+            config = relocated_run(config, load_config)
+            return config if update_config_callback is None else update_config_callback(config)
+
+        return opens(load_config, update_config_callback=updated, **options)  # type: ignore[misc]
+
+    if opens is not None:
+        script["eval_setup"] = opened
+    try:
+        yield
+    finally:
+        if opens is not None:
+            script["eval_setup"] = opens
 
 
 @contextmanager
@@ -172,7 +197,7 @@ def prepare(command: Any) -> bool:
         Whether the run is one of this package.
 
     Raises:
-        InputError: the run cannot be read by this version, has no checkpoint where nerfstudio looks for it, or the
+        InputError: the run cannot be read by this version, has no checkpoint beside it, or the
             command cannot work with it.
     """
     name = type(command).__name__
@@ -183,6 +208,7 @@ def prepare(command: Any) -> bool:
     if not isinstance(config.pipeline.model, SpectralModelConfig):
         return False
     require_method(config, path)
+    relocated_run(config, path)
     if name in _REFUSED:
         raise InputError(_REFUSED[name])
     if name == "ComputePSNR" and command.output_path.suffix != ".json":
@@ -206,17 +232,12 @@ def prepare(command: Any) -> bool:
             "ns-render interpolate goes from held-out view to held-out view, and this dataset has one; add "
             "--pose-source train."
         )
-    if name == "ExportPointCloud":  # opens runs that were moved as well
+    if name == "ExportPointCloud":  # `open_trained_run` checks the same
         return True
     checkpoints = config.get_checkpoint_dir()
-    if not checkpoints.is_dir():
-        raise InputError(
-            f"{checkpoints}: there is no such folder of checkpoints, which {path} names; call the command from the "
-            "folder that the run was trained from."
-        )
-    remedy = "the run has saved none, so train it again"
+    latest = find_checkpoint(checkpoints, config.load_step, "the run has saved none, so train it again")
     require_no_others(checkpoints)
-    require_model(find_checkpoint(checkpoints, config.load_step, remedy))
+    require_model(latest)
     if name == "ComputePSNR":
         command.output_path = _WrittenWhole(command.output_path)
     if name == "ExportTSDFMesh":

@@ -18,6 +18,7 @@ import yaml
 from nerfstudio.engine.trainer import TrainerConfig
 
 from hsi_sc_nerf.errors import InputError, shown
+from hsi_sc_nerf.packed.of_run import find_dataset
 
 _PACKAGES = ("nerfstudio", "hsi_sc_nerf")
 _OPTIMIZERS = "torch.optim"
@@ -56,6 +57,23 @@ def read_config(load_config: Path) -> TrainerConfig:
         raise InputError(
             f"{load_config}: cannot be read; give the config.yml of a run that this version of hsi-sc-nerf trained."
         ) from reason
+    return config
+
+
+def relocated_run(config: TrainerConfig, load_config: Path) -> TrainerConfig:
+    """Settings with the paths of where the run lies, which may have been moved, or trained from another folder.
+
+    Checkpoints are looked for beside the file, the dataset by `find_dataset`.
+
+    Args:
+        config: the settings, which are changed.
+        load_config: the file that holds them.
+    """
+    # By path alone: ns-eval writes the names of experiment and method, which a moved folder need not have.
+    config.get_base_dir = lambda: load_config.parent  # type: ignore[method-assign]
+    manager = config.pipeline.datamanager
+    if manager.data is not None:
+        manager.data = find_dataset(manager.data, load_config) or manager.data
     return config
 
 

@@ -14,10 +14,9 @@ from nerfstudio.engine.trainer import TrainerConfig
 from hsi_sc_nerf.data.datamanager import SpectralDataManager
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.models.checkpoints import find_checkpoint, require_model
-from hsi_sc_nerf.models.run_settings import read_config, require_method
+from hsi_sc_nerf.models.run_settings import read_config, relocated_run, require_method
 from hsi_sc_nerf.models.spectral_model import SpectralModel, SpectralModelConfig
 from hsi_sc_nerf.packed.dataset import PackedDataset
-from hsi_sc_nerf.packed.of_run import find_dataset
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,26 +83,13 @@ def open_trained_run(load_config: Path) -> TrainedRun:
     from nerfstudio.utils.eval_utils import eval_setup  # which imports the plugins, and so this file
 
     require_method(config, load_config)
-    folder = _relocated(config, load_config).get_checkpoint_dir()
+    folder = relocated_run(config, load_config).get_checkpoint_dir()
     latest = find_checkpoint(folder, remedy="the run has saved none, so train it again")
     require_model(latest)
 
-    def relocated(settings: TrainerConfig) -> TrainerConfig:
+    def found(settings: TrainerConfig) -> TrainerConfig:
         settings.load_step = int(latest.stem.removeprefix("step-"))  # nerfstudio would look at all files
-        return _relocated(settings, load_config)
+        return relocated_run(settings, load_config)
 
-    _, pipeline, _, _ = eval_setup(load_config, update_config_callback=relocated)
+    _, pipeline, _, _ = eval_setup(load_config, update_config_callback=found)
     return TrainedRun(cast(SpectralModel, pipeline.model), cast(SpectralDataManager, pipeline.datamanager))
-
-
-def _relocated(config: TrainerConfig, load_config: Path) -> TrainerConfig:
-    """Settings with the paths of where the run lies now; it may have been moved since training.
-
-    Checkpoints are looked for beside the file, the dataset by `find_dataset`.
-    """
-    config.output_dir = load_config.parent
-    config.experiment_name = config.method_name = config.timestamp = "."
-    manager = config.pipeline.datamanager
-    if manager.data is not None:
-        manager.data = find_dataset(manager.data, load_config) or manager.data
-    return config

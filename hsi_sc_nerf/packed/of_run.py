@@ -34,8 +34,9 @@ def require_dataset_of_run(load_config: Path) -> None:
 def find_dataset(named: Path, load_config: Path) -> Path | None:
     """Where a run's dataset lies now, None if it is not there.
 
-    A relative path is that of the folder in which the training was started: it is looked for from the working folder,
-    then from the run's folder upwards. With an absolute path, run and dataset may have been moved together.
+    A relative path is that of the folder in which the training was started. Where ``--output-dir`` was relative too,
+    that folder follows from where the run lies; otherwise the working folder is tried, and then the run's folder
+    upwards. With an absolute path, run and dataset may have been moved together.
 
     Args:
         named: path of the dataset in the run's settings.
@@ -44,8 +45,10 @@ def find_dataset(named: Path, load_config: Path) -> Path | None:
     folders = load_config.resolve().parents
     candidates = [named, *(folder / named for folder in folders)]
     before = _named_path(load_config, _OUTPUT_KEYS)
-    if named.is_absolute() and before is not None and before.is_absolute() and len(folders) > _DEPTH:
-        candidates.append(folders[_DEPTH] / os.path.relpath(named, before))
+    if before is not None and before.is_absolute() == named.is_absolute() and len(folders) > _DEPTH:
+        beside = folders[_DEPTH] / os.path.relpath(named, before)
+        # The same relative path can name another run's dataset in the working folder.
+        candidates.insert(len(candidates) if named.is_absolute() else 0, beside)
     return next((path for path in candidates if transforms_path(path).is_file()), None)
 
 

@@ -59,10 +59,10 @@ def scripts():
 
 @pytest.fixture
 def call(scripts, config_path):
-    def called(program, *words):
+    def called(program, *words, load_config=config_path):
         module, commands = scripts[program]
         split = 1 if commands == "Commands" else 0
-        arguments = [*words[:split], "--load-config", config_path, *words[split:]]
+        arguments = [*words[:split], "--load-config", load_config, *words[split:]]
         tyro.cli(getattr(module, commands), args=[str(word) for word in arguments]).main()
 
     return called
@@ -82,6 +82,34 @@ def ffmpeg(tmp_path, monkeypatch):
 def test_eval(call, tmp_path):
     call("ns-eval", "--output-path", tmp_path / "eval.json")
     assert 0 < json.loads((tmp_path / "eval.json").read_text())["results"]["sam"] < 0.2
+
+
+@pytest.mark.parametrize("typed", ["", "{}/apple"])
+def test_a_run_is_evaluated_and_rendered_where_it_lies(call, tmp_path, monkeypatch, typed):
+    """It was moved; in the working folder, and where it lay, the paths that were typed are another run's."""
+    trained, lies, other = tmp_path / "apple", tmp_path / "disk" / "apple", tmp_path / "pear"
+    trained.mkdir()
+    monkeypatch.chdir(trained)
+    typed = Path(typed.format(tmp_path)) / "out"
+    data = ball_run.write_ball_dataset(typed / "data")
+    written = (trained / ball_run.write_untrained_run(data, typed)).relative_to(trained)
+    lies.parent.mkdir()
+    trained.rename(lies)
+    checkpoints = other / written.parent / "nerfstudio_models"
+    checkpoints.mkdir(parents=True)
+    for path in (checkpoints / "step-000000001.ckpt", other / "out" / "other.txt"):
+        path.write_text("another run's")
+    if not typed.is_absolute():  # a dataset that is named absolutely, and is there, is taken
+        (other / "out" / "data").mkdir()
+        (other / "out" / "data" / "transforms.json").write_text("another run's")
+    other.rename(trained) if typed.is_absolute() else monkeypatch.chdir(other)
+    call("ns-eval", "--output-path", tmp_path / "eval.json", load_config=lies / written)
+    told = json.loads((tmp_path / "eval.json").read_text())
+    assert (told["experiment_name"], told["method_name"]) == ("ball", "hsi-sc-nerf")
+    assert Path(told["checkpoint"]).parent == lies / written.parent / "nerfstudio_models"
+    assert 0 < told["results"]["sam"] < 0.2
+    call("ns-render", "dataset", "--output-path", tmp_path, load_config=lies / written)
+    assert any((tmp_path / "test").iterdir())
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,19 @@ def test_a_dataset_is_looked_for_from_the_runs_folder_upwards(config, tmp_path):
     require_dataset_of_run(config)
 
 
+@pytest.mark.parametrize("data", ["out/data", "data"])
+def test_a_dataset_with_a_relative_path_is_that_of_the_run_and_not_of_the_working_folder(tmp_path, monkeypatch, data):
+    path = tmp_path / "apple" / "out" / "training" / "hsi-sc-nerf" / "run" / "config.yml"
+    path.parent.mkdir(parents=True)
+    path.write_text(yaml.dump({"output_dir": Path("out"), "pipeline": {"datamanager": {"data": Path(data)}}}))
+    for name in ("pear", "apple"):
+        folder = tmp_path / name / data
+        folder.mkdir(parents=True)
+        (folder / "transforms.json").write_text("{}")
+    monkeypatch.chdir(tmp_path / "pear")
+    assert find_dataset(Path(data), path).resolve() == folder
+
+
 @pytest.mark.parametrize("data", ["data", "../data"])
 def test_a_dataset_with_an_absolute_path_is_found_where_it_was_moved_with_the_run(tmp_path, data):
     """Of a name alone it is not: another dataset can have it."""
