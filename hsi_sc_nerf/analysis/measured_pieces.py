@@ -14,7 +14,7 @@ from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
 from hsi_sc_nerf.analysis.drawn_regions import DrawnRegion
 from hsi_sc_nerf.analysis.measurement import Measurement, measure_traits, on_container
 from hsi_sc_nerf.analysis.measurement_files import delete_earlier, write_measurement
-from hsi_sc_nerf.analysis.report import MM_PER_M, PIECES, trait_tables
+from hsi_sc_nerf.analysis.report import MM_PER_M, PIECES, scale_note, trait_tables
 from hsi_sc_nerf.analysis.standing_pieces import standing_pieces
 from hsi_sc_nerf.export.cloud import SpectralCloud
 from hsi_sc_nerf.files import atomic_write, make_folder, write_json
@@ -139,10 +139,11 @@ def _page(contents: Sequence[Mapping[str, Any]], name: str) -> str:
         ]
         for content, size in zip(contents, sizes, strict=True)
     ]
+    note = f"{len(contents)} objects stand on the table; x and y are of their middle, object frame."
     return "\n\n".join(
         [
             f"# Traits of {markdown_text(name)}",
-            f"{len(contents)} objects stand on the table; x and y are of their middle, object frame.",
+            f"{scale_note(contents[0])} {note}".lstrip(),
             markdown_table(header, rows),
             *(f"[All traits of piece {c['piece']}](piece-{c['piece']}/traits.md)" for c in contents),
             "",

@@ -133,6 +133,12 @@ def each_object(content: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     return pieces
 
 
+def scale_note(content: Mapping[str, Any]) -> str:
+    """That the sizes of an object of ``traits.json`` are no metres; empty where the scale was known."""
+    unknown = content.get("settings", {}).get("metric") is False
+    return "Sizes are wrong: nothing gave the session's scale, and 1 m is the camera's distance." if unknown else ""
+
+
 def trait_tables(content: Mapping[str, Any]) -> list[TraitTable]:
     """Sizes, classes and indices in mm, cm² and mL, from the content of ``traits.json``.
 
@@ -143,8 +149,7 @@ def trait_tables(content: Mapping[str, Any]) -> list[TraitTable]:
     state = "watertight" if content["watertight"] else "NOT watertight, so its volume cannot be trusted"
     closed_cm2 = CM2_PER_M2 * (size["area_m2"] - seen_m2)
     note = f"The mesh is {state}. {closed_cm2:.1f} cm² of its area, mainly the base, were not seen but closed."
-    if content.get("settings", {}).get("metric") is False:
-        note = f"Sizes are wrong: nothing gave the session's scale, and 1 m is the camera's distance. {note}"
+    note = f"{scale_note(content)} {note}".lstrip()
     if spread:
         note += f" ± is the standard deviation by {_listed(content['size_sd_by_cause'])}."
         missing = [words for cause, words in _CAUSES.items() if cause not in content["size_sd_by_cause"]]
@@ -159,8 +164,7 @@ def trait_tables(content: Mapping[str, Any]) -> list[TraitTable]:
         tables += _class_tables(content["classes"], seen_m2)
     tables.append(_reflectance_table(content["regions"]))
     regions = {name: region["indices"] for name, region in content["regions"].items()}
-    names = list(regions[WHOLE])
-    if names:
+    if names := list(regions[WHOLE]):
         rows = [[region, *(_map_mean(values[name]) for name in names)] for region, values in regions.items()]
         tables.append(TraitTable("Indices", _MAP_NOTE, ["region", *names], rows))
     if calibrations := content.get("calibrations"):

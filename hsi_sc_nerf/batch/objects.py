@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from hsi_sc_nerf.analysis.report import CM2_PER_M2, MM_PER_M, SIZES, each_object
+from hsi_sc_nerf.analysis.report import CM2_PER_M2, MM_PER_M, SIZES, each_object, scale_note
 from hsi_sc_nerf.analysis.traits import WHOLE
 from hsi_sc_nerf.batch import columns
 from hsi_sc_nerf.batch.columns import Column, Value
@@ -121,18 +121,21 @@ def _cost(step: str, content: Mapping[str, Any]) -> Iterator[tuple[Column, Value
 
 
 def _traits(content: Mapping[str, Any]) -> Iterator[tuple[Column, Value]]:
+    # Lengths of a cloud without scale are none; times NaN, they leave their cells empty.
+    metre = math.nan if scale_note(content) else 1.0
+    mm, cm2 = MM_PER_M * metre, CM2_PER_M2 * metre
     if "piece" in content:
         yield columns.PIECE, _number(content["piece"])
         for column, at in zip(columns.PIECE_AT, content["centre_m"], strict=False):
-            yield column, _number(at, MM_PER_M)
+            yield column, _number(at, mm)
     closed = bool(content["watertight"])
     for key, (_, _, factor) in SIZES.items():
         value, sd = columns.SIZE[key]
         if closed or key not in ("volume_l", "equivalent_diameter_m"):
-            yield value, _number(content["size"][key], factor)
-            yield sd, _number((content["size_sd"] or {}).get(key), factor)
+            yield value, _number(content["size"][key], factor * metre)
+            yield sd, _number((content["size_sd"] or {}).get(key), factor * metre)
     yield columns.WATERTIGHT, closed
-    yield columns.SEEN_AREA, _number(content["seen_area_m2"], CM2_PER_M2)
+    yield columns.SEEN_AREA, _number(content["seen_area_m2"], cm2)
     regions: Mapping[str, Any] = content["regions"]
     for key, value in regions[WHOLE]["reflectance"].items():
         if key in columns.REFLECTANCE:
@@ -145,25 +148,25 @@ def _traits(content: Mapping[str, Any]) -> Iterator[tuple[Column, Value]]:
     for name, found in regions[WHOLE].get("classifiers", {}).items():
         for label, area_m2 in found["areas_m2"].items():
             area, sd = columns.classifier_columns(name, label)
-            yield area, _number(area_m2, CM2_PER_M2)
-            yield sd, _number(found["area_sds_m2"].get(label), CM2_PER_M2)
+            yield area, _number(area_m2, cm2)
+            yield sd, _number(found["area_sds_m2"].get(label), cm2)
     if content["classes"]:
-        yield from _classes(content["classes"], float(content["seen_area_m2"]))
+        yield from _classes(content["classes"], float(content["seen_area_m2"]), cm2)
     for name, region in regions.items():
         if name != WHOLE:
             area, *reflectance = columns.region_columns(name)
-            yield area, _number(region["area_m2"], CM2_PER_M2)
+            yield area, _number(region["area_m2"], cm2)
             yield from zip(reflectance, (_number(region["reflectance"][key]) for key in ("mean", "std")), strict=True)
             for index, found in region["indices"].items():
                 yield columns.region_index_column(name, index), _number(found["mean"])
 
 
-def _classes(classes: Mapping[str, Any], seen_m2: float) -> Iterator[tuple[Column, Value]]:
+def _classes(classes: Mapping[str, Any], seen_m2: float, cm2: float) -> Iterator[tuple[Column, Value]]:
     areas_m2 = {**classes["areas_m2"], "in no class": classes["unclassified_m2"]}
     mixtures_m2 = {**classes["mixture_areas_m2"], "in no class": classes["mixture_unclassified_m2"]}
     for name, area_m2 in areas_m2.items():
         area, fraction, mixture = columns.class_columns(name)
-        yield area, _number(area_m2, CM2_PER_M2)
+        yield area, _number(area_m2, cm2)
         yield fraction, _number(area_m2, 1.0 / seen_m2)
         yield mixture, _number(mixtures_m2[name], 1.0 / seen_m2)
 

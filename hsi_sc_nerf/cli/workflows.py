@@ -14,7 +14,7 @@ import tyro
 from rich.console import Console
 from rich.markup import escape
 
-from hsi_sc_nerf.analysis.report import each_object
+from hsi_sc_nerf.analysis.report import each_object, scale_note
 from hsi_sc_nerf.batch.session_steps import (
     MATERIAL_NAME,
     STEPS_NAME,
@@ -101,6 +101,8 @@ def _show_results(out: Path, console: Console) -> None:
     scores = "SAM {sam:.4f} rad, RMSE {rmse:.4f}, SSIM {ssim:.3f}, PSNR {psnr:.1f} dB".format(**results)
     console.print(f"Held-out views, inside the mask: {scores}")
     traits = json.loads((out / "traits" / "traits.json").read_text(encoding="utf-8"))
+    if note := scale_note(each_object(traits)[0]):
+        console.print(f"[yellow]{note}")
     for one in each_object(traits):
         size, which = one["size"], f" of piece {one['piece']}" if "piece" in one else ""
         volume = f"volume {1000 * size['volume_l']:.1f} mL" if one["watertight"] else "no closed volume"

@@ -1,5 +1,7 @@
 """Objects that stand apart in one cloud are told apart and measured one by one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from standing_sphere import RADIUS_M, STAND_M, sphere_points
@@ -91,6 +93,7 @@ def test_each_object_is_measured_by_itself(tmp_path):
     captions = [table.caption for table in section.blocks]
     assert [caption[:14] for caption in captions if "Size" in caption] == ["Piece 1. Size.", "Piece 2. Size."]
     assert [finding.sentence[:7] for finding in section.findings] == ["Piece 1", "Piece 2"]
+    assert "wrong" not in (tmp_path / "traits.md").read_text()
 
     # The same folder again, with another number of objects.
     own = tmp_path / "piece-2" / "notes.txt"
@@ -99,7 +102,8 @@ def test_each_object_is_measured_by_itself(tmp_path):
     write_pieces(tmp_path, measured[:1], "two balls", piece=1)
     assert {"traits.json", "traits.md", "mesh.ply", "spectra.csv"} < set(names := files_in(tmp_path))
     assert {name for name in names if name.startswith(("piece-", "calibration_"))} == {"piece-2/notes.txt"}
-    write_pieces(tmp_path, measured, "two balls")
+    write_pieces(tmp_path, [replace(one, settings={"metric": False}) for one in measured], "two balls")
+    assert "Sizes are wrong" in (tmp_path / "traits.md").read_text()
     assert {name for name in files_in(tmp_path) if "/" not in name} == {"traits.json", "traits.md"}
     assert own.is_file()
     assert (tmp_path / "piece-1" / "region_spectra.png").is_file()

@@ -95,6 +95,21 @@ def test_a_mesh_with_holes_has_no_volume(tmp_path):
     assert not {"volume_ml", "volume_sd_ml", "equivalent_diameter_mm"} & row.keys()
 
 
+def test_without_a_scale_there_are_no_lengths_areas_and_volumes(tmp_path):
+    write_object(tmp_path / "pear")
+    write_object(tmp_path / "one", traits_of() | {"settings": {"metric": False}})
+    pieces = [{"piece": 1, "centre_m": [0.02, -0.01, 0.1], **traits_of(), "settings": {"metric": False}}]
+    write_object(tmp_path / "berry", {"pieces": pieces})
+    known, _ = row_of(tmp_path / "pear")
+    for name in ("one", "berry"):
+        row, _ = row_of(tmp_path / name)
+        assert row["status"] == "done"
+        sized = {column for column in row if column.endswith(("_ml", "_cm2", "_mm"))}
+        assert {"volume_ml", "height_mm", "seen_area_cm2", "class_bruise_area_cm2", "region_bruise_area_cm2"} < sized
+        assert {row[column] for column in sized} == {None}
+        assert all(row[column] == known[column] for column in known.keys() - sized)
+
+
 def test_what_failed_says_so_and_results_of_an_earlier_attempt_do_not_count(tmp_path):
     folder = tmp_path / "pear"
     write_object(folder)

@@ -127,6 +127,16 @@ def test_a_second_call_does_nothing_and_a_removed_result_is_made_again(whole, ru
     assert done(run(session, out)) == ["traits", "report"]
 
 
+@pytest.mark.parametrize("pieces", [[SIZE], [{"piece": 1} | SIZE, {"piece": 2} | SIZE]])
+def test_sizes_of_a_session_without_a_scale_are_said_to_be_wrong(tmp_path, capsys, pieces):
+    write_json(tmp_path / "eval.json", SCORES)
+    wrong = [one | {"settings": {"metric": False}} for one in pieces]
+    write_json(tmp_path / "traits" / "traits.json", {"pieces": wrong} if len(pieces) > 1 else wrong[0])
+    _show_results(tmp_path, Console(highlight=False, soft_wrap=True))
+    told = [line[:4] for line in capsys.readouterr().out.splitlines()]
+    assert told == ["Held", "Size", *["Size"] * len(pieces), "Open"]
+
+
 def test_at_the_end_stand_results_warnings_and_the_file_to_open(tmp_path, capsys):
     write_json(tmp_path / "eval.json", SCORES)
     write_json(tmp_path / "traits" / "traits.json", SIZE)
