@@ -17,8 +17,8 @@ from hsi_sc_nerf.files import atomic_write
 
 CSV_NAME, PARQUET_NAME, DICTIONARY_NAME = "traits.csv", "traits.parquet", "traits_dictionary.csv"
 _MEANINGS = {OBJECT: "name of the object, and of its folder", SESSION: "folder of its captures"}
-_NUMBER = re.compile(r"[+-]?(0|[1-9]\d{0,14})(\.\d*([eE][+-]?\d{1,2})?)?")
-"""Numbers, but not names such as 007, 1E2 or 12345678901234567890."""
+_NUMBER = re.compile(r"[+-]?(0|[1-9]\d{0,14})(\.\d*([eE][+-]?\d{1,2})?|[eE][+-]\d{1,2})?")
+"""Numbers, but not names such as 007, 1E2 or 12345678901234567890. Programs write 1e-05, with the exponent's sign."""
 
 
 @dataclass(frozen=True)

@@ -90,17 +90,22 @@ def test_names_of_columns_are_safe_and_never_shared():
 def test_names_that_look_like_numbers_stay_names(tmp_path):
     write_sessions(
         tmp_path,
-        [("1", "s", "007", "1.5", "1", "1E2", "1.5e-3"), ("2", "s", "010", "", "b", "1E3", "-2.E+2")],
-        ("object", "session", "id", "ph", "plot", "bed", "dose"),
+        [
+            ("1", "s", "007", "1.5", "1", "1E2", "1.5e-3", "1e-05"),
+            ("2", "s", "010", "", "b", "1E3", "-2.E+2", "-5E+05"),
+        ],
+        ("object", "session", "id", "ph", "plot", "bed", "dose", "offset"),
     )
     table = read_table(tmp_path)
     kinds = {column.name: column.kind for column in table.columns if column.group == "list"}
     assert kinds == {"object": "text", "session": "text", "id": "text", "ph": "number", "plot": "text"} | {
         "bed": "text",
         "dose": "number",
+        "offset": "number",
     }
     assert table.values(table.columns[3]) == [1.5, None]
     assert table.values(table.columns[6]) == [0.0015, -200.0]
+    assert table.values(table.columns[7]) == [1e-5, -5e5]
 
 
 def test_hostile_texts_come_back_as_they_are(tmp_path):
