@@ -44,7 +44,8 @@ class DayComparison:
         after: the day.
         quantities: changes since the first day, by name.
         earlier: name of the day before it.
-        grown: regions of each quantity that had changed since the first day, on the day before and on this one.
+        grown: regions of each quantity that had changed since the first day, on the day before and on this one; not
+            of those that were left out the day before.
         classes: regions of each class, on the first day and on this one; empty without a library.
         class_map: their maps; None without a library.
         left_out: indices that are defined on too little of the surface to be compared.
@@ -96,8 +97,9 @@ def compare_days(
         quantities = changes(first, after, bands_nm, indices, session_sd, repeat)
         grown = {}
         for name, quantity in quantities.items():
-            was = None if earlier is None else earlier.get(name)
-            then = np.zeros_like(quantity.changed) if was is None else was.changed
+            if earlier is not None and name not in earlier:
+                continue  # left out the day before, so that nobody knows what has grown since
+            then = np.zeros_like(quantity.changed) if earlier is None else earlier[name].changed
             grown[name] = grown_regions(mesh, areas_m2, then, quantity.changed)
         classes, class_map = {}, None
         if library is not None and at_first is not None:
