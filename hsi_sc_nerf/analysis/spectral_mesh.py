@@ -93,8 +93,13 @@ def with_spectra(
         material = None
     if material is not None:
         known &= np.isfinite(material).all(axis=1)
-    if not known.any():
+    if not np.isfinite(cloud.spectra).all(axis=1).any():
         raise InputError("no point of the cloud has a spectrum; export the cloud again.")
+    if not known.any():
+        raise InputError(
+            "no point of the cloud that has a spectrum has a known material; give `hsi-sc-nerf sample` as --material "
+            "the cloud that `hsi-sc-nerf material` made of the same object, or leave that option out."
+        )
     used = np.flatnonzero(known & (cloud.extra.get(INCIDENCE, np.zeros(len(cloud))) <= max_incidence_deg))
     if len(used) == 0:
         raise InputError(

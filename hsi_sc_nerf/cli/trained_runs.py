@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
 import tyro
 from rich.console import Console
 from rich.markup import escape
@@ -95,7 +96,7 @@ class SampleCommand:
         check_options(self)
         require_dataset_of_run(self.load_config)
         from hsi_sc_nerf.export.cloud import run_name
-        from hsi_sc_nerf.export.cloud_material import read_material
+        from hsi_sc_nerf.export.cloud_material import MAX_DISTANCE_M, read_material
         from hsi_sc_nerf.export.sample_points import read_points, sample_points, write_sampled_ply
         from hsi_sc_nerf.models.trained_run import open_trained_run
 
@@ -123,6 +124,11 @@ class SampleCommand:
             console.print(
                 f"[yellow]{no_spectrum:,} of {count:,} points have no spectrum (NaN): no training camera that "
                 f"faces them sees a surface within {self.max_distance_mm:g} mm of them."
+            )
+        if added is not None and (unknown := int(((found.views > 0) & np.isnan(added[0]).any(axis=1)).sum())):
+            console.print(
+                f"[yellow]{unknown:,} of {count - no_spectrum:,} points with spectra have no known material (NaN): "
+                f"they lie further than {MAX_DISTANCE_M * 1e3:g} mm from the points of {escape(str(self.material))}."
             )
         bands = len(wavelengths_nm)
         console.print(f"{escape(str(output))}: {count - no_spectrum:,} points with spectra of {bands} bands.")

@@ -245,7 +245,7 @@ def test_points_whose_material_is_not_known_give_no_spectrum():
     assert not found.seen[cloud.points[:, 1] < -0.002].any()
     assert found.seen[~far].all()
     assert classified(found, LIBRARY, 0.1).names == LIBRARY.names
-    with pytest.raises(InputError, match="no point of the cloud has a spectrum"):
+    with pytest.raises(InputError, match="known material"):
         with_spectra(surface.mesh, replace(cloud, spectra=np.where(far[:, None], cloud.spectra, np.nan)), 0.001)
 
 

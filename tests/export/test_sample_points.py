@@ -145,7 +145,7 @@ def test_a_ball_gives_its_spectrum_where_cameras_see_it(tmp_path, sample, capsys
     assert f"{(~seen).sum()} of {len(seen)} points have no spectrum" in " ".join(capsys.readouterr().out.split())
 
 
-def test_points_get_the_material_of_the_cloud_that_tells_it(tmp_path, sample):
+def test_points_get_the_material_of_the_cloud_that_tells_it(tmp_path, sample, capsys):
     path, far = tmp_path / "ball.ply", tmp_path / "far.ply"
     sphere_mesh(path)
     material = factory.PLANT / 0.8
@@ -160,7 +160,11 @@ def test_points_get_the_material_of_the_cloud_that_tells_it(tmp_path, sample):
     sphere_mesh(far, radius_m=factory.SPHERE_RADIUS_M + 0.0045)
     beyond = read_spectral_ply(sample(far, material=known, max_distance_mm=6.0))
     assert np.isnan(material_spectra(beyond)).all()
-    assert np.isfinite(beyond.spectra).any()
+    seen = np.isfinite(beyond.spectra).all(axis=1)
+    assert seen.any()
+    told = " ".join(capsys.readouterr().out.split())
+    assert told.count("no known material") == 1  # of the cloud on the surface nothing is said
+    assert f"{seen.sum():,} of {seen.sum():,} points with spectra have no known material" in told
 
 
 def test_clouds_without_the_material_or_with_other_bands_are_refused(tmp_path, sample):
