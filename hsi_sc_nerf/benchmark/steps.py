@@ -62,7 +62,8 @@ def run_step(
     started = time.perf_counter()
     # Warnings of libraries would hide the progress bars. Nothing here is compiled by PyTorch, but nerfstudio's import
     # compiles two functions of a method that is not used, for which PyTorch loads its compiler for seconds.
-    defaults = {"TORCHDYNAMO_DISABLE": "1", "GOMP_SPINCOUNT": str(SPINS)}
+    # By the last one Python (from 3.11 on) takes no file of the working folder for a module of its name.
+    defaults = {"TORCHDYNAMO_DISABLE": "1", "GOMP_SPINCOUNT": str(SPINS), "PYTHONSAFEPATH": "1"}
     environment = defaults | os.environ | {"PYTHONWARNINGS": "ignore"}
     if environment.pop("PYTHONDONTWRITEBYTECODE", None):
         # Compiled modules halve the start of nerfstudio; they are kept beside the log.

@@ -70,6 +70,13 @@ def test_a_step_runs_where_the_batch_was_called(planned, tmp_path, monkeypatch, 
     assert one.caller == tmp_path / "caller"
 
 
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="Python always looks into the working folder")
+@pytest.mark.parametrize("words", [("-c", "import colorsys"), ("-m", "colorsys")])
+def test_a_file_in_the_callers_folder_is_no_module_of_a_step(planned, tmp_path, words):
+    (tmp_path / "colorsys.py").write_text("raise SystemExit(3)")
+    runner_of(planned()["pear"])("process", [sys.executable, *words], tmp_path / "log.txt")
+
+
 def test_a_file_that_words_name_is_looked_for_where_the_batch_was_called(planned, tmp_path, monkeypatch):
     (tmp_path / "skin.csv").write_text("1")
     do(planned(traits="--library skin.csv")["pear"])
