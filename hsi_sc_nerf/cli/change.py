@@ -20,7 +20,7 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
 from hsi_sc_nerf.analysis.standing_pieces import one_piece
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, SpectralCloud, read_spectral_ply, run_name
+from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, SpectralCloud, oblique_note, read_spectral_ply, run_name
 from hsi_sc_nerf.files import require_writable
 from hsi_sc_nerf.settings_file import between, check_options
 
@@ -101,6 +101,9 @@ class ChangeCommand:
         console = Console(stderr=True)
         clouds = [_read(path) for path in track(files, "Reading", console=console, transient=True)]
         _require_others(names, clouds, lambda one, other: np.array_equal(one.points, other.points))
+        for name, cloud in zip(names, clouds, strict=True):
+            if note := oblique_note(cloud, name):
+                console.print(f"[yellow]{escape(note)}", soft_wrap=True)
         clouds = _pieces(clouds, names, self.piece or (None,), self.mesh)
         indices = find_indices(self.index, clouds[0].wavelengths_nm)
         require_own_names(self.band_nm, indices)

@@ -174,7 +174,7 @@ class TraitsCommand:
         from hsi_sc_nerf.analysis.measured_pieces import measure_pieces, write_pieces
         from hsi_sc_nerf.analysis.measurement import on_container
         from hsi_sc_nerf.analysis.standing_pieces import standing_pieces
-        from hsi_sc_nerf.export.cloud import INCIDENCE, read_spectral_ply
+        from hsi_sc_nerf.export.cloud import oblique_note, read_spectral_ply
         from hsi_sc_nerf.packed.dataset import open_packed
 
         self.check()
@@ -203,12 +203,8 @@ class TraitsCommand:
             piece=self.piece,
         )
         console = Console(stderr=True)
-        if not {INCIDENCE, "sampled_views"} & set(cloud.extra):  # `sample` chooses its views by the angle
-            console.print(
-                f"[yellow]{escape(self.cloud.name)} has no {INCIDENCE}, so that spectra seen obliquely count too; "
-                "if CloudCompare saved it, open the original there again with Add all.",
-                soft_wrap=True,
-            )
+        if note := oblique_note(cloud, self.cloud.name):
+            console.print(f"[yellow]{escape(note)}", soft_wrap=True)
         with console.status("tables and pictures"):
             write_pieces(self.output_dir, measured, self.cloud.name, self.piece)
         if self.propose_regions:

@@ -116,6 +116,21 @@ def stream(cloud: SpectralCloud, chunk_points: int = CHUNK_POINTS) -> CloudStrea
     return CloudStream(len(cloud), cloud.wavelengths_nm, tuple(cloud.extra), chunks)
 
 
+def oblique_note(cloud: SpectralCloud, name: str) -> str:
+    """That spectra count at whatever angle they were seen, as the cloud does not tell it; empty where it does.
+
+    Args:
+        cloud: the cloud.
+        name: what it is called in the sentence.
+    """
+    if {INCIDENCE, "sampled_views"} & set(cloud.extra):  # `sample` chooses its views by the angle
+        return ""
+    return (
+        f"{name} has no {INCIDENCE}, so that spectra seen obliquely count too; if CloudCompare saved it, open the "
+        "original there again with Add all."
+    )
+
+
 def statistical_inliers(points: Float[np.ndarray, "n 3"], std_ratio: float) -> Int[np.ndarray, "inliers"]:
     """Indices of the points whose mean distance to their neighbours is usual for the cloud.
 

@@ -15,7 +15,7 @@ from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
 from hsi_sc_nerf.cli import change
 from hsi_sc_nerf.cli.change import ChangeCommand
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.export.cloud import read_spectral_ply, write_spectral_ply
+from hsi_sc_nerf.export.cloud import INCIDENCE, read_spectral_ply, write_spectral_ply
 from hsi_sc_nerf.models import trained_run
 
 NM = np.linspace(400.0, 1000.0, 13)
@@ -179,6 +179,18 @@ def test_bad_input_is_one_sentence_and_nothing_is_written(clouds, tmp_path):
     with pytest.raises(InputError, match="session-std"):
         ChangeCommand((first, other), out, session_std=-1.0).main()
     assert not out.exists()
+
+
+def test_clouds_that_do_not_tell_their_angles_are_named(clouds, tmp_path, capfd):
+    """CloudCompare leaves the column out, and then oblique spectra count."""
+    cloud = read_spectral_ply(clouds / "monday" / "point_cloud.ply")
+    write_spectral_ply(tmp_path / "monday.ply", replace(cloud, extra={INCIDENCE: np.zeros(len(cloud))}))
+    write_spectral_ply(tmp_path / "copy.ply", replace(cloud, points=cloud.points + np.float32(0.01)))
+    days = (tmp_path / "monday.ply", tmp_path / "copy.ply")
+    with pytest.raises(InputError, match="--piece is 2"):
+        ChangeCommand(days, tmp_path / "out", piece=(2,)).main()
+    (told,) = (line for line in capfd.readouterr().err.splitlines() if INCIDENCE in line)
+    assert told.startswith("2 copy has no ")
 
 
 def test_days_whose_files_have_one_name_are_named_by_their_folders(tmp_path):
