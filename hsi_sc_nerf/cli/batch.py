@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from hsi_sc_nerf import batch
-from hsi_sc_nerf.batch.plan import STEPS, outdated, read_plan, unlisted, write_plan
+from hsi_sc_nerf.batch.plan import OBJECTS_NAME, STEPS, outdated, read_plan, unlisted, write_plan
 from hsi_sc_nerf.batch.session_list import OBJECT, Row, read_sessions
 from hsi_sc_nerf.batch.session_steps import SessionSettings
 from hsi_sc_nerf.benchmark.steps import require_posix
@@ -76,11 +76,12 @@ class BatchCommand(SessionSettings):
         if find_spec("snakemake") is None:
             raise InputError("Snakemake is not installed; pip install 'hsi-sc-nerf[batch]' (Python 3.11 or newer).")
         out, rows = self.output_dir, read_sessions(self.sessions)
-        check_words(self)
+        check_words(self, [out / OBJECTS_NAME / row[OBJECT] for row in rows])
         for row in rows:
             if row.get("process"):
                 try:
-                    check_words(replace(self, process=f"{self.process} {row['process']}"))
+                    own = replace(self, process=f"{self.process} {row['process']}")
+                    check_words(own, [out / OBJECTS_NAME / row[OBJECT]])
                 except InputError as error:
                     raise InputError(f"the object {row[OBJECT]}: {error}") from error
         locking = not {"--unlock", "--nolock"} & {*self.other_words}

@@ -149,7 +149,7 @@ class TraitsCommand:
         for path in self.calibration:
             read_calibration(path)
 
-    def _require_inputs_kept(self) -> None:
+    def require_inputs_kept(self) -> None:
         """Refuse to write over what the command is given.
 
         Raises:
@@ -161,7 +161,10 @@ class TraitsCommand:
         also += ["endmembers.csv"] if self.components else []
         for path in (self.cloud, self.library, self.roi_file, *self.calibration):
             if path is not None and is_replaced(path, self.output_dir, also):
-                raise InputError(f"{path}: would be replaced by the results; choose another --output-dir.")
+                raise InputError(
+                    f"{path}: would be replaced by the results; copy it to another folder and name the copy, or "
+                    "choose another --output-dir."
+                )
 
     def main(self) -> None:
         """Measure and write.
@@ -178,7 +181,7 @@ class TraitsCommand:
         from hsi_sc_nerf.packed.dataset import open_packed
 
         self.check()
-        self._require_inputs_kept()
+        self.require_inputs_kept()
         require_writable(self.output_dir)
         library = read_library(self.library) if self.library else None
         if library is not None and self.classes:

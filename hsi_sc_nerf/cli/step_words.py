@@ -3,24 +3,34 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import tyro
 
-from hsi_sc_nerf.batch.session_steps import SessionSettings
+from hsi_sc_nerf.batch.session_steps import SessionSettings, session_steps
 from hsi_sc_nerf.benchmark.configurations import split_words
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.settings_file import check_options
 
 
-def check_words(settings: SessionSettings) -> None:
+def check_words(settings: SessionSettings, outs: Sequence[Path] = ()) -> None:
     """Check the words for our commands; those for ns-train are left to it.
 
+    Args:
+        settings: with the words.
+        outs: folders for the results of the sessions that they are for.
+
     Raises:
-        InputError: a command does not take its words, or a number lies outside its range.
+        InputError: a command does not take its words, a number lies outside its range, or words name a file that
+            their own step replaces.
     """
+    for out in outs:
+        _require_inputs_kept(settings, out)
     from hsi_sc_nerf.cli.clouds import TraitsCommand
     from hsi_sc_nerf.cli.light import MaterialCommand
     from hsi_sc_nerf.cli.sessions import ProcessCommand
@@ -38,6 +48,23 @@ def check_words(settings: SessionSettings) -> None:
             check()
         except InputError as error:
             raise InputError(f"--{name}: {error}") from error
+    for out in outs:
+        try:
+            replace(traits, output_dir=out / "traits").require_inputs_kept()
+        except InputError as error:
+            raise InputError(f"--traits: {error}") from error
+
+
+def _require_inputs_kept(settings: SessionSettings, out: Path) -> None:
+    """Refuse words that name a result of their own step, which would be outdated by it for ever."""
+    for step in session_steps(Path(), out, settings):
+        written = [path.resolve() for path in step.outputs]
+        for path in step.inputs:
+            if path.resolve() in written:
+                raise InputError(
+                    f"--{step.name}: {path} is what this step of {out} itself writes; copy it to another folder and "
+                    "name the copy."
+                )
 
 
 def _read(name: str, words: str, command: Any, *given: str) -> Any:

@@ -67,7 +67,7 @@ class RunCommand(SessionSettings):
             InputError: a step failed, there is no session, or the output folder holds something else.
         """
         check_options(self)
-        check_words(self)
+        check_words(self, [self.output_dir])
         out = self.output_dir
         if not self.session.is_dir():
             raise InputError(f"{self.session}: is no folder; give that of a capture session.")

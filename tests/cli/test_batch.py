@@ -10,6 +10,7 @@ import re
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from quick_steps import quick_snakefile
 from hsi_sc_nerf.batch.plan import STEPS, read_plan
 from hsi_sc_nerf.cli import batch
 from hsi_sc_nerf.cli.batch import SNAKEFILE, BatchCommand
+from hsi_sc_nerf.cli.workflows import RunCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
 
@@ -190,6 +192,21 @@ def test_what_is_refused_leaves_no_lock_and_no_folder(tmp_path, monkeypatch):
     for _ in range(2):  # the second time it is no longer said that another batch works there
         with pytest.raises(InputError, match="Snakemake ended early"):
             BatchCommand(sessions=sessions, output_dir=tmp_path / "out").main()
+
+
+@pytest.mark.slow
+def test_words_that_name_a_result_of_one_of_the_objects_are_refused_before_the_first_step(tmp_path):
+    """The step that writes it would fail after hours of training."""
+    sessions, out = make_sessions(tmp_path / "sessions", ["a", "b"]), tmp_path / "out"
+    own = out / "objects" / "b"
+    path = own / "traits" / "spectra.csv"
+    path.parent.mkdir(parents=True)
+    path.write_text("wavelength_nm,skin\n500,0.1\n600,0.2\n")
+    before = files(tmp_path)
+    for made in (BatchCommand(sessions=sessions, output_dir=out), RunCommand(sessions / "b", own)):
+        with pytest.raises(InputError, match=r"spectra\.csv: .*copy it to another folder"):
+            replace(made, traits=f"--library {path}").main()
+    assert files(tmp_path) == before
 
 
 @pytest.mark.slow

@@ -4,8 +4,10 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Literal, get_args, get_origin, get_type_hints
 
+import numpy as np
 import pytest
 
+from hsi_sc_nerf.analysis.library import SpectralLibrary, write_library
 from hsi_sc_nerf.batch.session_steps import SessionSettings
 from hsi_sc_nerf.cli.change import ChangeCommand
 from hsi_sc_nerf.cli.main import COMMANDS, _imported
@@ -79,6 +81,31 @@ def test_words_for_a_step_are_refused_before_the_first(settings, told):
     check_words(SessionSettings(traits="--index 'CRI = 1/R510 - 1/R550' --index own=R510"))
     with pytest.raises(InputError, match=told):
         check_words(settings)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "result"),
+    [
+        ({"process": "--camera {}/data"}, "data/transforms.json"),
+        ({"material": "--light {}/point_cloud-material.json"}, "point_cloud-material.json"),
+        ({"traits": "--library {}/traits/regions.sli"}, "traits/regions.sli"),
+        ({"traits": "--library={}/traits/piece-1/spectra.csv"}, "traits/piece-1/spectra.csv"),
+    ],
+)
+def test_words_do_not_name_what_their_own_step_writes(tmp_path, words, result):
+    """The step would be outdated by its own result for ever, or fail after hours of training."""
+    path, other = tmp_path / "ball" / result, tmp_path / "pear"
+    path.parent.mkdir(parents=True)
+    path.write_text("{}")
+    if "library" in str(words):
+        write_library(path, SpectralLibrary(("skin",), np.array([500.0, 600.0]), np.ones((1, 2))))
+    ((step, text),) = words.items()
+    settings = SessionSettings(**{step: text.format(tmp_path / "ball")})
+    with pytest.raises(InputError, match=rf"--{step}: [^\n]*{path.name}[^\n]* copy it to another folder"):
+        check_words(settings, [other, tmp_path / "ball"])
+    if step != "material":  # that it is no light is said by another sentence
+        check_words(settings, [other])
 
 
 def test_process_refuses_it_before_it_looks_at_the_session(tmp_path):
