@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -119,6 +119,22 @@ def _may_be_decimals(rows: Sequence[list[str]], named: int, columns: int) -> boo
     longer = any(len(row) > named and row[columns][:1].isdecimal() for row in rows)
     marked = any(mark in cell for row in rows for cell in row if _is_number(cell) for mark in ".,")
     return longer and not marked
+
+
+def read_notes(path: Path) -> dict[str, str]:
+    """What the notes of a table say (`keyed`), without a look at its numbers.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is no text.
+    """
+    return keyed(_note(line) for line in _text(path).splitlines() if _is_note(line))
+
+
+def keyed(notes: Iterable[str]) -> dict[str, str]:
+    """Values of notes ``key: value`` by their keys in lower case."""
+    pairs = (note.partition(":") for note in notes if ":" in note)
+    return {key.strip().lower(): value.strip(" ;,\t") for key, _, value in pairs}
 
 
 def number_in(text: str) -> float:

@@ -19,7 +19,7 @@ from hsi_sc_nerf.analysis.maps import SurfaceMap
 from hsi_sc_nerf.analysis.preprocessing import Step, preprocessed, read_steps
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.number_table import number_in, numbers_in, read_number_table
+from hsi_sc_nerf.number_table import keyed, number_in, numbers_in, read_number_table
 from hsi_sc_nerf.spectra import nearest_bands
 
 _KEYS = {
@@ -262,8 +262,7 @@ def _read_table(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
         ValueError: it is no table, or has two intercepts.
     """
     table = read_number_table(path, blanks=_INTERCEPTS)
-    pairs = (note.partition(":") for note in table.notes if ":" in note)
-    head, columns = {key.strip().lower(): value.strip(" ;,\t") for key, _, value in pairs}, table.by_title()
+    head, columns = keyed(table.notes), table.by_title()
     for title in _COEFFICIENTS:
         if title in columns and "coefficient" not in columns:
             columns["coefficient"] = columns.pop(title)

@@ -153,7 +153,7 @@ def _read_table(path: Path) -> tuple[list[str], np.ndarray, np.ndarray]:
 
 def _read_envi(path: Path) -> tuple[list[str], np.ndarray, np.ndarray]:
     """An ENVI library is an image of one band: each line a spectrum, each sample a wavelength."""
-    header_path, data = _envi_pair(path)
+    header_path, data = envi_pair(path)
     header = read_header(header_path, library=True)
     if header.wavelengths_nm is None:
         raise InputError(f"{header_path}: lists no wavelengths; add them.")
@@ -171,8 +171,12 @@ def _read_envi(path: Path) -> tuple[list[str], np.ndarray, np.ndarray]:
     return names.tolist(), header.wavelengths_nm, spectra / header.reflectance_scale
 
 
-def _envi_pair(path: Path) -> tuple[Path, Path]:
-    """Header and data file of a library, either of which is given."""
+def envi_pair(path: Path) -> tuple[Path, Path]:
+    """Header and data file of a library, either of which is given.
+
+    Raises:
+        InputError: the other one is missing.
+    """
     given_header, base = path.suffix.lower() == ".hdr", path.with_suffix("")
     stems, endings = ([base], ("", ".sli", ".SLI")) if given_header else ([base, path], (".hdr", ".HDR"))
     candidates = [stem.with_name(stem.name + ending) for stem in stems for ending in endings]

@@ -8,7 +8,8 @@ import math
 import os
 import shlex
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,13 @@ from rich.console import Console
 from rich.markup import escape
 
 from hsi_sc_nerf import __version__
+from hsi_sc_nerf.analysis.library import envi_pair
 from hsi_sc_nerf.benchmark.configurations import split_words
 from hsi_sc_nerf.benchmark.steps import StepCost, typed_command
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import make_folder, read_json, write_json
 from hsi_sc_nerf.models.presets import Preset
+from hsi_sc_nerf.number_table import read_notes
 from hsi_sc_nerf.settings_file import between
 
 STEPS_NAME = "steps.json"
@@ -32,6 +35,8 @@ OPTIONAL_STEPS = ("inspect", "material")
 """Where one of these fails, the others do without."""
 _DATASET_NAME = "transforms.json"
 """The file of a dataset that tells of its frames."""
+_ENVI = (".sli", ".hdr", "")
+"""Endings of the two files of an ENVI library."""
 StepRunner = Callable[[str, Sequence[str], Path], StepCost]
 """Runs a command; gets the step's name, the command and the file for its output."""
 
@@ -225,10 +230,24 @@ def bring_up_to_date(step: Step, out: Path, console: Console, title: str, run_st
 
 
 def _named_files(text: str, folder: Path) -> list[Path]:
-    """Files that the user's words name, also behind an equals sign; of a dataset's folder ``transforms.json``."""
+    """Files that the user's words name, also behind an equals sign; of a dataset's folder ``transforms.json``.
+
+    Of an ENVI library they are both files, and with a calibration's table goes the model that it names.
+    """
     named = [folder / value for word in split_words(text) for value in (word, word.partition("=")[2]) if value]
     # `os.path` takes names that are too long for a file, such as formulas.
-    return [path for one in named for path in (one, one / _DATASET_NAME) if os.path.isfile(path)]
+    files = [path for one in named for path in (one, one / _DATASET_NAME) if os.path.isfile(path)]
+    return [path for one in files for path in (one, *_with(one))]
+
+
+def _with(path: Path) -> Iterator[Path]:
+    """What is read where a file is named, beside it."""
+    if path.suffix.lower() in _ENVI:
+        with suppress(InputError):
+            yield from envi_pair(path)
+    with suppress(OSError, ValueError):
+        if model := read_notes(path).get("model"):
+            yield path.with_name(Path(model).name)
 
 
 def _within(folder: Path, path: Path) -> str:

@@ -82,6 +82,23 @@ def test_an_earlier_dataset_that_the_words_name_is_an_input(captures):
     assert fingerprints("pear", "out", process="--camera earlier")["process"] != before["process"]
 
 
+@pytest.mark.parametrize(
+    ("named", "text", "beside"),
+    [
+        ("water.csv", "# Model: nets/water.onnx;;\nwavelength_nm\n500\n", "water.onnx"),
+        ("skin.sli", "\0", "skin.hdr"),
+        ("skin.hdr", "ENVI", "skin.sli"),
+    ],
+)
+def test_a_file_that_is_read_with_one_that_the_words_name_is_an_input(captures, named, text, beside):
+    (captures / named).write_text(text)
+    (captures / beside).write_text("1")
+    before = fingerprints("pear", "out", traits=f"--option {named}")
+    (captures / beside).write_text("22")
+    after = fingerprints("pear", "out", traits=f"--option {named}")
+    assert [name for name in before if before[name] != after[name]] == ["traits"]
+
+
 def test_relative_words_start_from_the_callers_folder(captures, monkeypatch):
     (captures / "own").write_text("1")
     here = fingerprints(captures / "pear", captures / "out", traits="own")
