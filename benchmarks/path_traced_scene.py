@@ -25,6 +25,8 @@ MARKERS, MARKER_SIDE_M, MARKER_RADIUS_M = 8, 0.044, 0.101
 DICTIONARY = "DICT_4X4_50"
 DISTANCE_M, ELEVATION_DEG, AIM_M = 0.72, 33.0, np.array([0.0, 0.0, 0.045])
 WALL_BEHIND_M = 0.3
+GLOSS = 0.045
+"""Fraction of the fruit's light that is reflected as by rough metal, whatever the wavelength."""
 
 
 def _bell(nm: np.ndarray, centre_nm: float, width_nm: float) -> np.ndarray:
@@ -205,20 +207,32 @@ def _objects(
     return objects
 
 
-def _fruit(fruit: trimesh.Trimesh, nodes_nm: np.ndarray, lit: dict[str, Any] | None, spots: int) -> Any:
+def skin_fractions(fruit: trimesh.Trimesh, spots: int) -> tuple[np.ndarray, np.ndarray]:
+    """Fraction of the blush in the skin, and of dark spots over both, at each vertex (v,)."""
     x, y, z = fruit.vertices.T
     azimuth = np.arctan2(y, x)
     blush = np.clip(0.5 + 0.7 * np.cos(azimuth - 0.7) + 0.25 * np.sin(170.0 * z + 3.0 * azimuth), 0.0, 1.0)
     centres = fruit.vertices[np.random.default_rng(3).choice(len(fruit.vertices), spots, replace=False)]
     near_m = KDTree(centres).query(fruit.vertices)[0]
-    spotted = np.clip((0.0018 - near_m) / 0.0008, 0.0, 1.0)
+    return blush, np.clip((0.0018 - near_m) / 0.0008, 0.0, 1.0)
+
+
+def material_reflectance(fruit: trimesh.Trimesh, spots: int, nm: np.ndarray) -> Float[np.ndarray, "v bands"]:
+    """Diffuse reflectance at each vertex, which the gloss leaves."""
+    blush, spotted = (fraction[:, None] for fraction in skin_fractions(fruit, spots))
+    skin, red, spot = (MATERIALS[name](nm).clip(0.0, 1.0) for name in ("skin", "blush", "spot"))
+    return (1.0 - GLOSS) * ((1.0 - spotted) * ((1.0 - blush) * skin + blush * red) + spotted * spot)
+
+
+def _fruit(fruit: trimesh.Trimesh, nodes_nm: np.ndarray, lit: dict[str, Any] | None, spots: int) -> Any:
+    blush, spotted = skin_fractions(fruit, spots)
     skin = _blend(
         _matte(nodes_nm, "skin"), _matte(nodes_nm, "blush"), {"type": "mesh_attribute", "name": "vertex_blush"}
     )
     body = _blend(skin, _matte(nodes_nm, "spot"), {"type": "mesh_attribute", "name": "vertex_spot"})
     gloss = {"type": "roughconductor", "material": "none", "alpha": 0.12}
     properties = mi.Properties()
-    properties["surface"] = mi.load_dict({"type": "twosided", "bsdf": _blend(body, gloss, 0.045)})
+    properties["surface"] = mi.load_dict({"type": "twosided", "bsdf": _blend(body, gloss, GLOSS)})
     if lit is not None:
         properties["emitter"] = mi.load_dict(lit)
     mesh = mi.Mesh("fruit", len(fruit.vertices), len(fruit.faces), properties, has_vertex_normals=True)
@@ -275,10 +289,20 @@ def wood_grain(size: int = 512) -> Float[np.ndarray, "h w 1"]:
 def _tarp(nodes_nm: np.ndarray) -> dict[str, Any]:
     """The tarp that is held before the camera instead of the turntable."""
     held = _look_at(AIM_M, AIM_M - _direction(0.0, ELEVATION_DEG)) @ np.diag([0.125, 0.125, 1.0, 1.0])
-    weave = np.random.default_rng(2).normal(0.0, 0.012, (96, 96, 1)).clip(-0.03, 0.03) + 0.03
-    cloth = _blend(_matte(nodes_nm, "tarp"), _matte(nodes_nm, "ink"), _texture(weave.astype(np.float32), "bilinear"))
+    cloth = _blend(_matte(nodes_nm, "tarp"), _matte(nodes_nm, "ink"), _texture(_weave(), "bilinear"))
     bsdf = {"type": "twosided", "bsdf": cloth}
     return {"tarp": {"type": "rectangle", "to_world": mi.ScalarTransform4f(held), "bsdf": bsdf}}
+
+
+def _weave() -> Float[np.ndarray, "96 96 1"]:
+    """Fraction of dark threads in the tarp."""
+    return (np.random.default_rng(2).normal(0.0, 0.012, (96, 96, 1)).clip(-0.03, 0.03) + 0.03).astype(np.float32)
+
+
+def tarp_reflectance(nm: np.ndarray) -> np.ndarray:
+    """Mean reflectance of the tarp, which a session takes for white."""
+    dark = float(_weave().mean())
+    return (1.0 - dark) * MATERIALS["tarp"](nm) + dark * MATERIALS["ink"](nm)
 
 
 def _matte(nodes_nm: np.ndarray, name: str) -> dict[str, Any]:

@@ -1,0 +1,235 @@
+"""How accurate all of `hsi-sc-nerf run` is on a session that shares no code with our simulator.
+
+    uv run python benchmarks/path_traced_accuracy.py --output-dir OUT
+    uv run python benchmarks/path_traced_accuracy.py --output-dir OUT --fruit long --size 128
+
+The session is that of ``independent_session.py``: path-traced, glossy, with near lamps and a wooden wall. `run` works
+on it as in a laboratory, with no word but the seed of the training. Its results are compared with what the path
+tracer knows: held-out views with many rays, without drift and the sensor's noise; the mesh; the reflectance of the
+skin below its gloss. What is finished is not done again.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+import trimesh
+import tyro
+from independent_session import BANDS, NODES_NM, IndependentSession, mixing_matrix
+from jaxtyping import Float
+from open3d.core import Tensor
+from paper_tables import mean_and_deviation
+from path_traced_scene import PathTracedScene, material_reflectance, tarp_reflectance
+from results_table import RESULTS, write_results
+from scipy.ndimage import gaussian_filter
+from session_mistakes import measured_errors
+from true_object import relative_rms
+
+from hsi_sc_nerf.analysis.report import each_object
+from hsi_sc_nerf.benchmark.run import HeldOutViews
+from hsi_sc_nerf.cli.workflows import RunCommand
+from hsi_sc_nerf.evaluation.spatial import Surface, sample_surface, score_at
+from hsi_sc_nerf.evaluation.spectral_metrics import spectral_metrics
+from hsi_sc_nerf.export.cloud import INCIDENCE, SpectralCloud, material_spectra, read_spectral_ply
+from hsi_sc_nerf.files import read_json, write_json
+from hsi_sc_nerf.geometry.mesh import ray_scene
+from hsi_sc_nerf.models.presets import Preset
+from hsi_sc_nerf.models.trained_run import TrainedRun, open_trained_run
+from hsi_sc_nerf.simulate.scores import visible_from
+from hsi_sc_nerf.spectra import nearest_bands
+
+COLUMNS: dict[str, int] = {
+    "rotation, deg": 3,
+    "position, mm": 2,
+    "focal length, %": 2,
+    "mask, IoU": 3,
+    "SAM, rad": 4,
+    "RMSE": 4,
+    "noise: SAM, rad": 4,
+    "noise: RMSE": 4,
+    "F at 2 mm, %": 1,
+    "F at 1 mm, %": 1,
+    "F at 0.5 mm, %": 1,
+    "height above the surface, mm": 2,
+    "area, %": 2,
+    "volume, %": 2,
+    "as measured: 5 %": 3,
+    "50 %": 3,
+    "95 %": 3,
+    "material: 5 %": 3,
+    "median": 3,
+    "95 % of material": 3,
+    "spots, %": 1,
+    "worst spot, %": 1,
+}
+"""Columns of the table and their decimals."""
+THRESHOLDS_M = {"F at 2 mm, %": 0.002, "F at 1 mm, %": 0.001, "F at 0.5 mm, %": 0.0005}
+NOISE_FREE_RAYS = 2048
+WHITE_BLUR_PX = 6.0
+"""Sigma over which the rendered tarp is averaged: its light is smooth, its weave and the paths' noise are not."""
+POINTS = 300_000
+FRONTAL_DEG = 65.0
+SPOTS, SPOT_RADIUS_M = 200, 0.005
+
+
+@dataclass(frozen=True)
+class PathTracedAccuracy:
+    """Render a session, run on it, judge the results."""
+
+    output_dir: Path
+    """Folder of the session and the results."""
+    frames: int = 36
+    """Frames of one turn."""
+    size: int = 128
+    """Width and height of the images, pixels."""
+    rays: int = 256
+    """Rays in each pixel of the session."""
+    fruit: Literal["quince", "long"] = "quince"
+    """Shape of the fruit."""
+    preset: Preset = "balanced"
+    """Of `hsi-sc-nerf run`."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Of the training."""
+    words: str = ""
+    """More words for the training; they are part of the row's name."""
+    results: Path = RESULTS
+    """Folder of the CSV file."""
+
+    def main(self) -> None:
+        """Do what is missing, print the table, write it."""
+        if not (self.session / "truth" / "mesh.ply").is_file():
+            IndependentSession(self.session, self.frames, self.size, self.rays, self.fruit).main()
+        found = [self._judged(seed) for seed in self.seeds]
+        cells = [mean_and_deviation([one[name] for one in found], digits) for name, digits in COLUMNS.items()]
+        name = f"{self.fruit}, {self.frames} views of {self.size} px"
+        row = [name, f"{self.preset} {self.words}".strip(), *cells]
+        seeds = f"scene, runs {' '.join(map(str, self.seeds))}"
+        titles = ["fruit", "training", *COLUMNS]
+        write_results("path_traced_accuracy", titles, [row], keys=2, seed=seeds, folder=self.results)
+
+    @property
+    def folder(self) -> Path:
+        """Folder of this fruit."""
+        return self.output_dir / f"{self.fruit}-{self.size}-{self.frames}-{self.rays}"
+
+    @property
+    def session(self) -> Path:
+        """The path-traced session."""
+        return self.folder / "session"
+
+    def _judged(self, seed: int) -> dict[str, float]:
+        """Figures of one run."""
+        words = "".join(letter if letter.isalnum() else "_" for letter in self.words)
+        out = self.folder / f"{self.preset}{words}-{seed}"
+        kept = out / "judged.json"
+        if not kept.is_file():
+            train = f"--machine.seed {seed} {self.words}".strip()
+            RunCommand(self.session, out, preset=self.preset, train=train).main()
+            write_json(kept, self._figures(out))
+        return read_json(kept, "delete it to judge the run again")
+
+    def _figures(self, out: Path) -> dict[str, float]:
+        run = open_trained_run(out / "training" / "hsi-sc-nerf" / "run" / "config.yml")
+        cloud = read_spectral_ply(out / "point_cloud.ply")
+        corrected = out / "point_cloud-material.ply"
+        material = material_spectra(read_spectral_ply(corrected)) if corrected.is_file() else None
+        errors = dict(zip(COLUMNS, map(float, measured_errors(out / "data", self.session)[:4]), strict=False))
+        figures = errors | self._views(run) | self._surface(run, cloud) | self._sizes(out)
+        return figures | self._brightness(cloud, cloud.spectra if material is None else material)
+
+    @cached_property
+    def _scene(self) -> PathTracedScene:
+        return PathTracedScene(NODES_NM, self.size, NOISE_FREE_RAYS, self.fruit, sampler="multijitter", seed=77)
+
+    def _noise_free(self, capture: str) -> Float[np.ndarray, "h w 204"]:
+        """Reflectance of a capture without the noise of paths and sensor."""
+        mixing = mixing_matrix()
+        path, white_path = (self.folder / f"noise-free-{name}.npy" for name in (capture, "tarp"))
+        if not white_path.is_file():
+            np.save(white_path, gaussian_filter(self._scene.tarp(1000), (WHITE_BLUR_PX, WHITE_BLUR_PX, 0)))
+        if not path.is_file():
+            truth = read_json(self.session / "truth" / "truth.json", "render the session again")
+            number, angle_deg = next(
+                (number, frame["angle_deg"])
+                for number, frame in enumerate(truth["frames"])
+                if frame["capture"] == capture
+            )
+            np.save(path, self._scene.radiance(angle_deg, number))
+        return (np.load(path) @ mixing) / (np.load(white_path) @ mixing)
+
+    def _views(self, run: TrainedRun) -> dict[str, float]:
+        """Held-out views and their measured cubes against noise-free ones, inside the true mask's pure pixels."""
+        coverage = np.load(self.session / "truth" / "masks.npz")
+        frames = run.manager.eval_dataset.metadata["frames"]
+        bands = nearest_bands(BANDS, run.dataset.wavelengths_nm)
+        found: dict[str, list[float]] = {}
+        for camera, batch in HeldOutViews(run.manager.fixed_indices_eval_dataloader, None):
+            with torch.no_grad():
+                rendered = run.model.get_outputs_for_camera(camera)["spectral"].cpu()
+            capture = frames[batch["image_idx"]].capture
+            true = torch.from_numpy(self._noise_free(capture)[..., bands]).float()
+            mask = batch["mask"][..., 0].bool() & torch.from_numpy(coverage[capture] > 0.5)
+            for prefix, image in (("", rendered), ("noise: ", batch["spectral"])):
+                metrics = spectral_metrics(image, true, mask)
+                found.setdefault(f"{prefix}SAM, rad", []).append(metrics["sam"])
+                found.setdefault(f"{prefix}RMSE", []).append(metrics["rmse"])
+        return {name: float(np.mean(values)) for name, values in found.items()}
+
+    @cached_property
+    def _mesh(self) -> trimesh.Trimesh:
+        mesh = trimesh.load(self.session / "truth" / "mesh.ply", process=False)
+        assert isinstance(mesh, trimesh.Trimesh)
+        return mesh
+
+    def _surface(self, run: TrainedRun, cloud: SpectralCloud) -> dict[str, float]:
+        """F-scores of what a camera sees, and the median signed distance from the true surface."""
+        vertices, faces = np.asarray(self._mesh.vertices), np.asarray(self._mesh.faces)
+        scene = ray_scene(vertices, faces)
+        points_m = sample_surface(vertices, faces, POINTS)
+        seen = np.any([visible_from(scene, points_m, pose[:3, 3]) for pose in run.dataset.camera_to_worlds], axis=0)
+        heights_m = scene.compute_signed_distance(Tensor(cloud.points.astype(np.float32))).numpy().astype(float)
+        distances_m = np.abs(heights_m), Surface(cloud.points).distances_m(points_m[seen])
+        scores = {name: score_at(*distances_m, limit_m).f_score for name, limit_m in THRESHOLDS_M.items()}
+        return scores | {"height above the surface, mm": 1e3 * float(np.median(heights_m))}
+
+    def _sizes(self, out: Path) -> dict[str, float]:
+        traits = json.loads((out / "traits" / "traits.json").read_text(encoding="utf-8"))
+        size = next(iter(each_object(traits)))["size"]
+        true: Mapping[str, float] = {"area": self._mesh.area, "volume": self._mesh.volume}
+        return {
+            "area, %": 100.0 * (size["area_m2"] / true["area"] - 1.0),
+            "volume, %": 100.0 * (size["volume_l"] / 1e3 / true["volume"] - 1.0),
+        }
+
+    def _brightness(self, cloud: SpectralCloud, material: Float[np.ndarray, "n bands"]) -> dict[str, float]:
+        """Brightness of frontal points relative to the skin's, as measured and as the material's; spots of 10 mm."""
+        frontal = np.flatnonzero(cloud.extra[INCIDENCE] < FRONTAL_DEG)
+        scene = ray_scene(np.asarray(self._mesh.vertices), np.asarray(self._mesh.faces))
+        nearest = scene.compute_closest_points(Tensor(cloud.points[frontal].astype(np.float32)))
+        corner = self._mesh.faces[nearest["primitive_ids"].numpy().astype(int)][:, 0]
+        skin = material_reflectance(self._mesh, self._scene.spots, cloud.wavelengths_nm)
+        true = (skin / tarp_reflectance(cloud.wavelengths_nm))[corner]
+        measured, corrected = cloud.spectra[frontal], material[frontal]
+        apparent, bright = (spectra.mean(axis=1) / true.mean(axis=1) for spectra in (measured, corrected))
+        names = ("as measured: 5 %", "50 %", "95 %", "material: 5 %", "median", "95 % of material")
+        values = [*np.quantile(apparent, [0.05, 0.5, 0.95]), *np.quantile(bright, [0.05, 0.5, 0.95])]
+        points = cloud.points[frontal]
+        centres = points[np.random.default_rng(0).choice(len(points), SPOTS, replace=False)]
+        near = (np.linalg.norm(points - centre, axis=1) < SPOT_RADIUS_M for centre in centres)
+        spots = [relative_rms(corrected[some].mean(axis=0), true[some].mean(axis=0)) for some in near]
+        figures = dict(zip(names, map(float, values), strict=True))
+        return figures | {
+            "spots, %": 100.0 * float(np.median(spots)),
+            "worst spot, %": 100.0 * max(spots),
+        }
+
+
+if __name__ == "__main__":
+    tyro.cli(PathTracedAccuracy).main()
