@@ -165,7 +165,10 @@ class PathTracedAccuracy:
         return (np.load(path) @ mixing) / (np.load(white_path) @ mixing)
 
     def _views(self, run: TrainedRun) -> dict[str, float]:
-        """Held-out views and their measured cubes against noise-free ones, inside the true mask's pure pixels."""
+        """Held-out views and their measured cubes against noise-free ones.
+
+        Pixels count where the dataset's mask and more than half of the true coverage show the fruit.
+        """
         coverage = np.load(self.session / "truth" / "masks.npz")
         frames = run.manager.eval_dataset.metadata["frames"]
         bands = nearest_bands(BANDS, run.dataset.wavelengths_nm)

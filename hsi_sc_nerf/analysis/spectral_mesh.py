@@ -89,12 +89,12 @@ def with_spectra(
         InputError: that leaves no point.
     """
     known, material = np.isfinite(cloud.spectra).all(axis=1), material_spectra(cloud)
+    if not known.any():
+        raise InputError("no point of the cloud has a spectrum; export the cloud again.")
     if not set(LIGHT_COLUMNS) <= set(cloud.extra):
         material = None
     if material is not None:
         known &= np.isfinite(material).all(axis=1)
-    if not np.isfinite(cloud.spectra).all(axis=1).any():
-        raise InputError("no point of the cloud has a spectrum; export the cloud again.")
     if not known.any():
         raise InputError(
             "no point of the cloud that has a spectrum has a known material; give `hsi-sc-nerf sample` as --material "
