@@ -13,7 +13,6 @@ from __future__ import annotations
 import errno
 import shutil
 import sys
-import time
 import types
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -143,7 +142,8 @@ def _nothing_half_exported(command: Any) -> Iterator[None]:
         InputError: the disk is full.
     """
     folder = getattr(command, "output_dir", None) or getattr(command, "output_path", None)
-    started = time.time()
+    # Not by the clock: a disk's own clock lags behind, and that of a network drive may be minutes off.
+    earlier = {} if folder is None else _written(folder, command)
     failure: Exception | None = None
     try:
         yield
@@ -155,15 +155,21 @@ def _nothing_half_exported(command: Any) -> Iterator[None]:
         if failure is not None:
             raise failure
         return
-    begun = [folder / name for name in _EXPORTED]
-    # Renders write a file, or pictures in a folder of its name.
-    if hasattr(command, "rendered_output_names"):
-        places = [folder, *folder.rglob("*"), *folder.with_suffix("").rglob("*")]
-        begun = [path for path in places if path.suffix in _RENDERED]
-    for path in begun:
-        if path.is_file() and path.stat().st_mtime >= started:
+    for path, written_ns in _written(folder, command).items():
+        if earlier.get(path) != written_ns:
             path.unlink()
     raise InputError(f"{folder}: cannot be written to, because the disk is full; free some space.") from failure
+
+
+def _written(folder: Path, command: Any) -> dict[Path, int]:
+    """When the files that an export or a render writes were written, of those that are there."""
+    paths = [folder / name for name in _EXPORTED]
+    # Renders write a file, or pictures in a folder of its name.
+    if hasattr(command, "rendered_output_names"):
+        pictures = folder.parent / folder.stem  # of a path without a name, as `.` is, the folder itself
+        places = [folder, *folder.rglob("*"), *pictures.rglob("*")]
+        paths = [path for path in places if path.suffix in _RENDERED]
+    return {path: path.stat().st_mtime_ns for path in paths if path.is_file()}
 
 
 def _is_full(folder: Path, failure: Exception | None) -> bool:
