@@ -12,7 +12,7 @@ from jaxtyping import Float
 from rich.console import Console
 from rich.markup import escape
 
-from hsi_sc_nerf.export.cloud import LIGHT_COLUMNS
+from hsi_sc_nerf.export.cloud import GLOSS, LIGHT_COLUMNS
 from hsi_sc_nerf.packed.of_run import require_dataset_of_run
 from hsi_sc_nerf.settings_file import between, check_options
 
@@ -83,7 +83,7 @@ class MaterialCommand:
         require_writable(output.parent)
         file_format, stem = format_of(output), output.with_suffix("")
         cloud = read_spectral_ply(self.cloud)
-        extra = {*cloud.extra, *LIGHT_COLUMNS, *band_property_names(cloud.wavelengths_nm, "material")}
+        extra = {*cloud.extra, *LIGHT_COLUMNS, GLOSS, *band_property_names(cloud.wavelengths_nm, "material")}
         require_format(stem, file_format, len(cloud.wavelengths_nm), len(extra))
         if run is None:
             run = open_trained_run(self.load_config)
@@ -125,6 +125,13 @@ def sentences(told: dict[str, Any]) -> list[str]:
         f"{evidence['profile_std']:.2f} times as much as the light that was found predicts; 1 means that the light "
         "is right, 0 that the light is even."
     ]
+    gloss = told.get("gloss")
+    if told["corrected"] and gloss is not None:
+        mirrored, error = 100.0 * gloss["reflectance"], 100.0 * gloss["std"]
+        lines.append(
+            f"The highlights of the lamps show that the skin mirrors {mirrored:.1f} ± {error:.1f} % of the light; "
+            "the material's columns are without it (column gloss)."
+        )
     if told.get("support_unknown"):
         lines.append(
             "Warning: the container is not known, so the shade of what the object stands on is left out; state "
@@ -153,6 +160,7 @@ def light_summary(
         light_from: file that the light was taken from.
     """
     irradiance, std = (cloud.extra[name] for name in LIGHT_COLUMNS)
+    gloss = found.light.fit.gloss
     return {
         "corrected": corrected,
         "shaded": found.evidence.shaded,
@@ -161,5 +169,6 @@ def light_summary(
         "light_from": None if light_from is None else str(light_from),
         "support_unknown": found.support_unknown,
         "scatter": found.light.fit.scatter,
+        "gloss": None if gloss is None else {"reflectance": gloss.reflectance, "std": gloss.std},
         "light": found.stationary.values(),
     }

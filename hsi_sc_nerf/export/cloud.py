@@ -30,6 +30,8 @@ INCIDENCE = "incidence_deg"
 """Column: the angle between a point's normal and the ray that gave its spectrum."""
 LIGHT_COLUMNS = ("irradiance", "irradiance_std")
 """Columns of the light on a point, which `hsi-sc-nerf material` adds."""
+GLOSS = "gloss"
+"""Column: what a glossy skin mirrors, which `hsi-sc-nerf material` takes off."""
 MAX_INCIDENCE_DEG = 70.0
 """At larger angles of incidence a pixel also covers what lies beside the surface (docs/how-to/traits.md)."""
 OUTLIER_NEIGHBOURS = 20
@@ -39,7 +41,7 @@ FRAME = (
     "the first frame"
 )
 REFLECTANCE = ("1", "reflectance factor relative to the white reference in full light")
-MATERIAL = ("1", "reflectance factor of the material: as measured, divided by the irradiance in the band")
+MATERIAL = ("1", "reflectance factor of the material: as measured without gloss, over the irradiance in the band")
 _POSITION = ("m", "position in the object frame")
 _NORMAL = ("1", "outward unit normal")
 _COLOUR = ("1", "pseudo-RGB of the spectrum, 0 to 255")
@@ -55,7 +57,8 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "sampled_views": ("1", "number of training views that were averaged"),
     "sampled_std": ("1", "standard deviation of the reflectance over these views, mean over bands"),
     "irradiance": ("1", "irradiance relative to that on the white reference, mean over bands"),
-    "irradiance_std": ("1", "standard deviation of the irradiance"),
+    "irradiance_std": ("1", "standard deviation of the irradiance; relative to it, that of the material"),
+    "gloss": ("1", "what the skin mirrors, as reflectance, mean over bands"),
 }
 """CF unit and meaning of each column that this package writes, the bands' apart."""
 _GEOMETRY = ("x", "y", "z", "nx", "ny", "nz")

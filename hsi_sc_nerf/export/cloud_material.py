@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import (
+    GLOSS,
     LIGHT_COLUMNS,
     SpectralCloud,
     band_property_names,
@@ -24,6 +25,7 @@ from hsi_sc_nerf.export.cloud import (
 )
 from hsi_sc_nerf.light.fit import WHITE_STD
 from hsi_sc_nerf.light.of_run import RunLight
+from hsi_sc_nerf.light.views import SMALLEST
 from hsi_sc_nerf.spectra import SAME_BAND_NM, same_bands
 
 NEIGHBOURS = 4
@@ -76,7 +78,7 @@ class CloudMaterial:
 def with_material(
     cloud: SpectralCloud, found: RunLight, run_nm: Float[np.ndarray, "bands"], *, corrected: bool
 ) -> SpectralCloud:
-    """The cloud with the columns of material and irradiance.
+    """The cloud with the columns of material and irradiance, and that of gloss if some was found.
 
     Args:
         found: the light in the run.
@@ -88,13 +90,22 @@ def with_material(
     bands = require_bands_of_run(cloud, run_nm, "the cloud")
     # Shade that is found but not corrected is an error of unknown size.
     std = np.full(len(cloud), np.nan if found.evidence.shaded else WHITE_STD)
-    material, irradiance = cloud.spectra, np.ones(len(cloud))
+    material, irradiance, gloss = cloud.spectra, np.ones(len(cloud)), {}
     if corrected:
-        by_band, std = found.irradiance(cloud.points.astype(float))
-        material, irradiance = cloud.spectra / by_band[:, bands], by_band.mean(axis=1)
+        points_m = cloud.points.astype(float)
+        frames, _, normals = found.frontal(points_m)
+        frames = np.maximum(frames, 0)
+        by_band, std = found.light.irradiance(points_m, normals, frames)
+        irradiance, mirrored = by_band.mean(axis=1), found.light.mirrored(normals, frames)
+        if mirrored is not None:
+            added, added_std = mirrored
+            material = np.maximum(material - added[:, bands], SMALLEST)
+            gloss = {GLOSS: added.mean(axis=1)}
+            std = np.hypot(std, irradiance * added_std / material.mean(axis=1))
+        material = material / by_band[:, bands]
     names = band_property_names(cloud.wavelengths_nm, "material")
-    columns = dict(zip([*names, *LIGHT_COLUMNS], [*material.T, irradiance, std], strict=True))
-    extra = {name: column for name, column in cloud.extra.items() if name not in columns}
+    columns = dict(zip([*names, *LIGHT_COLUMNS], [*material.T, irradiance, std], strict=True)) | gloss
+    extra = {name: column for name, column in cloud.extra.items() if name not in {*columns, GLOSS}}
     return replace(cloud, extra=extra | {name: column.astype(np.float32) for name, column in columns.items()})
 
 

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from hsi_sc_nerf.evaluation.spatial import sample_surface
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, image_coordinates, unit_vectors
 from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene, unoccluded
-from hsi_sc_nerf.light.views import ElementViews
+from hsi_sc_nerf.light.views import SMALLEST, ElementViews
 
 SUPPORT_SIDES = 25
 """Triangles of the support along the disc's radius: 4 mm on a turntable, so that each belongs to one element."""
@@ -28,8 +28,6 @@ NORMAL_WEIGHT = 2.0
 LARGEST_INCIDENCE_DEG, LARGEST_INCIDENCE_OF_SUPPORT_DEG = 70.0, 80.0
 """More oblique pixels also cover neighbouring parts. Every camera sees the lid obliquely."""
 
-SMALLEST = 1e-3
-"""Reflectance that noise does not exceed."""
 MISPLACED_PX = 0.3
 """Poses, surface and interpolation are uncertain by this fraction of a pixel."""
 

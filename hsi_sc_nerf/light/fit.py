@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.geometry.camera import unit_vectors
-from hsi_sc_nerf.light.material_fit import LightFit, MaterialFitting
+from hsi_sc_nerf.light.material_fit import GLOSS_STEPS, LightFit, MaterialFitting
 from hsi_sc_nerf.light.shared_errors import CORRELATED, SharedErrors
 from hsi_sc_nerf.light.stationary_light import (
     DEGREE_OF_TERM,
@@ -90,6 +90,10 @@ def fit_light(elements: TurningElements, views: ElementViews, white_normal: Floa
     fit.unevenness = UNEVENNESS
     fit.errors = SharedErrors(elements.cells[views.element], elements.facing(views))
     fit.converge(estimate_unevenness=True)
+    for _ in range(GLOSS_STEPS):
+        if not fit.take_gloss_off():
+            break
+        fit.converge(estimate_unevenness=True)
     return fit.result(fit.covariance())
 
 
@@ -232,7 +236,7 @@ class _LightFitting(MaterialFitting):
         expected = self.materials(irradiance)[self.views.element] * irradiance
         chamber, lamps = self.direct()
         slope = (lamps - chamber * of_lamps / of_chamber)[:, None] / irradiance
-        residual, slope = self.without_materials(self.views.reflectance / expected - 1.0, slope)
+        residual, slope = self.without_materials(self.measured / expected - 1.0, slope)
         weighted = self.precision[:, None] / CORRELATED * slope
         gain = (weighted * slope).sum(axis=0) + COLOUR_STD**-2
         step = ((weighted * residual).sum(axis=0) + (1.0 - light.lamp_colour) * COLOUR_STD**-2) / gain

@@ -14,7 +14,7 @@ from hsi_sc_nerf.light.fit import fit_light
 from hsi_sc_nerf.light.known_light import KnownLight
 from hsi_sc_nerf.light.material_fit import LEAST_IRRADIANCE, OCCLUSION_ERROR, LightFit, materials_under
 from hsi_sc_nerf.light.stationary_light import even_directions
-from hsi_sc_nerf.light.views import ElementViews, TurningElements, transfer
+from hsi_sc_nerf.light.views import SMALLEST, ElementViews, TurningElements, transfer
 
 RAY_DIRECTIONS = 4096
 """Number of rays over the sphere: 3.2 degrees apart."""
@@ -33,7 +33,7 @@ class ObjectLight:
     Attributes:
         elements: elements of the object and its support.
         turning: the elements as they turn under the light.
-        views: measurements of them in the frames.
+        views: measurements of them in the frames, without what the skin mirrors.
         fit: the light by groups of bands.
         spectral: the fit's light and materials at the bands of the views.
     """
@@ -76,6 +76,23 @@ class ObjectLight:
         result = np.maximum(result, LEAST_IRRADIANCE)
         relative = np.sqrt((weights * self._relative_variance[nearest]).sum(axis=1))
         return result, relative * result.mean(axis=1)
+
+    def mirrored(
+        self, normals: Float[np.ndarray, "n 3"], frames: Int[np.ndarray, "n"]
+    ) -> tuple[Float[np.ndarray, "n bands"], Float[np.ndarray, "n"]] | None:
+        """What the skin mirrors into the camera in one frame each, as reflectance; None where no gloss was found.
+
+        Args:
+            normals: outward unit normals of the points, object frame.
+            frames: the frame that measured each point.
+
+        Returns:
+            The mirrored light, and the standard deviation of its mean over the bands.
+        """
+        if self.fit.gloss is None:
+            return None
+        in_camera = np.einsum("nk,nkj->nj", normals, self.turning.rotations[frames])
+        return self.fit.gloss.at(in_camera, self.spectral.light)
 
     @property
     def _spacing_m(self) -> float:
@@ -160,6 +177,9 @@ def light_on_object(
     irradiance = fit.irradiance @ between.T
     entries = fit.weights, (views.element, np.arange(len(views.element)))
     weighted = scipy.sparse.csr_array(entries, shape=(len(elements.positions), len(views.element)))
+    if fit.gloss is not None:
+        added = np.where(views.shows_light[:, None], fit.gloss.at(turning.normals_in_camera(views), light)[0], 0.0)
+        views = replace(views, reflectance=np.maximum(views.reflectance - added, SMALLEST))
     above, below = weighted @ (views.reflectance * irradiance), weighted @ irradiance**2
     seen = below[:, 0] > 0.0
     material = np.clip(above / np.maximum(below, 1e-9), 1e-4, 1.0)

@@ -2,7 +2,8 @@
 
 An element of reflectance rho has the radiance rho times its irradiance. Its irradiance changes from view to view,
 because the element turns under stationary light; its material does not change, and follows from all views by weighted
-least squares. Elements light each other, with the materials that were found. Tukey's weights leave out gloss.
+least squares. Elements light each other, with the materials that were found. Light that the skin mirrors is taken off
+once it is found (`Gloss`); Tukey's weights leave out what is left of it.
 """
 
 from __future__ import annotations
@@ -14,9 +15,10 @@ import scipy.sparse
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
+from hsi_sc_nerf.light.gloss import HIGHLIGHT_ERROR, Gloss, find_gloss, mirrored_chamber
 from hsi_sc_nerf.light.shared_errors import SMALLEST_SCATTER, scatter_beyond
 from hsi_sc_nerf.light.stationary_light import StationaryLight
-from hsi_sc_nerf.light.views import ElementViews, LampUnits, TurningElements
+from hsi_sc_nerf.light.views import SMALLEST, ElementViews, LampUnits, TurningElements
 from hsi_sc_nerf.robust_scatter import robust_std, tukey_weights
 
 OCCLUSION_ERROR = 0.1
@@ -24,6 +26,8 @@ OCCLUSION_ERROR = 0.1
 LEAST_IRRADIANCE = 0.02
 STEPS = 6
 """Turns of materials, bounces and weights under a known light: none changes any longer."""
+GLOSS_STEPS, GLOSS_SETTLED = 6, 0.001
+"""Turns of gloss and light, and the change of the mirrored fraction that ends them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +43,7 @@ class LightFit:
         irradiance: at each measurement.
         scatter: robust standard deviation of the measurements relative to the model.
         relative_std: relative standard deviation of each measurement's irradiance due to the light's uncertainty.
+        gloss: what the skin mirrors; None where no highlights tell.
     """
 
     light: StationaryLight
@@ -48,6 +53,7 @@ class LightFit:
     irradiance: Float[np.ndarray, "m bands"]
     scatter: float
     relative_std: Float[np.ndarray, "m"]
+    gloss: Gloss | None
 
 
 def materials_under(
@@ -65,11 +71,11 @@ def materials_under(
         views: their measurements.
     """
     fit = MaterialFitting(elements, views, light)
-    for _ in range(STEPS):
-        fit.bounce()
-        residual, _ = fit.linearised()
-        fit.weigh(residual)
-    fit.bounce()
+    fit.settle()
+    for _ in range(GLOSS_STEPS):
+        if not fit.take_gloss_off():
+            break
+        fit.settle()
     return fit.result(covariance)
 
 
@@ -84,6 +90,8 @@ class MaterialFitting:
 
     def __init__(self, elements: TurningElements, views: ElementViews, light: StationaryLight) -> None:
         self.elements, self.views, self.light = elements, views, light
+        self.gloss: Gloss | None = None
+        self.measured = views.reflectance  # without what the skin mirrors
         count = len(views.element), len(elements.positions)
         entries = np.ones(count[0]), (views.element, np.arange(count[0]))
         self._sum_by_element = scipy.sparse.csr_array(entries, shape=count[::-1])
@@ -92,10 +100,35 @@ class MaterialFitting:
         self._chamber = elements.chamber_at(views)
         occluded = 1.0 - elements.transfer.sky[views.element]
         self._own_std = np.hypot(views.own_std, OCCLUSION_ERROR * occluded)
+        self._highlight_std = np.zeros(count[0])
         self.precision = np.zeros(count[0])
         self.weights, self.scatter = np.ones(count[0]), 0.0
         self.bounced = np.zeros((count[0], views.reflectance.shape[1]), np.float32)
         self.lamps = elements.lamps_at(views, light.to_lamps)
+
+    def settle(self) -> None:
+        """Find materials, bounces and weights under the light of now."""
+        for _ in range(STEPS):
+            self.bounce()
+            residual, _ = self.linearised()
+            self.weigh(residual)
+        self.bounce()
+
+    def take_gloss_off(self) -> bool:
+        """Find what the skin mirrors under the light of now; False if that is nothing, or as much as before."""
+        used, normals = self.views.shows_light, self.elements.normals_in_camera(self.views)
+        before = 0.0 if self.gloss is None else self.gloss.reflectance
+        diffuse = self.materials(self.irradiance())[self.views.element] * self.irradiance()
+        left = (self.views.reflectance - diffuse).mean(axis=1) - before * mirrored_chamber(normals, self.light)
+        found = find_gloss(normals[used], left[used], self.light)
+        if found is None:
+            return False
+        self.gloss = found
+        added = np.where(used[:, None], found.at(normals, self.light)[0], 0.0)
+        self.measured = np.maximum(self.views.reflectance - added, SMALLEST)
+        expected = np.maximum(diffuse.mean(axis=1), SMALLEST)
+        self._highlight_std = HIGHLIGHT_ERROR * used * found.highlight(normals) / expected
+        return abs(found.reflectance - before) > GLOSS_SETTLED
 
     def bounce(self) -> None:
         """Irradiance at the measurements by other elements, from the light and materials of now."""
@@ -117,7 +150,7 @@ class MaterialFitting:
         light, irradiance = self.light, self.irradiance()
         expected = self.materials(irradiance)[self.views.element] * irradiance
         band_weights = expected**2 / (expected**2).sum(axis=1, keepdims=True)
-        residual = (band_weights * (self.views.reflectance / expected - 1.0)).sum(axis=1)
+        residual = (band_weights * (self.measured / expected - 1.0)).sum(axis=1)
         by_chamber = (band_weights * light.chamber_colour / irradiance).sum(axis=1)[:, None]
         by_lamps = (band_weights * light.lamp_colour / irradiance).sum(axis=1)[:, None]
         units: LampUnits = self.lamps
@@ -137,11 +170,14 @@ class MaterialFitting:
         """Find the scatter and the measurements' weights."""
         used = self.views.shows_light
         self.scatter = float(robust_std(residual[used], least=SMALLEST_SCATTER))
-        beyond = scatter_beyond(residual[used], self._own_std[used])
-        std = np.hypot(beyond, self._own_std)
+        own_std = np.hypot(self._own_std, self._highlight_std)
+        beyond = scatter_beyond(residual[used], own_std[used])
+        std = np.hypot(beyond, own_std)
         # Never 0, so that no element is left without a measurement.
         self.weights = np.where(used, np.maximum(tukey_weights(residual / std), 1e-6), 1.0)
         self.precision = self.weights * used / std**2
+        # A highlight that is not taken off in full would brighten the material, and so be found smaller each time.
+        self.weights = self.weights / (1.0 + (self._highlight_std / beyond) ** 2)
 
     def irradiance(self) -> Float[np.ndarray, "m bands"]:
         """At the measurements."""
@@ -157,7 +193,7 @@ class MaterialFitting:
 
     def materials(self, irradiance: np.ndarray) -> Float[np.ndarray, "n bands"]:
         """The reflectance of each element that fits its measurements best."""
-        above = self._sum_by_element @ (self.weights[:, None] * self.views.reflectance * irradiance)
+        above = self._sum_by_element @ (self.weights[:, None] * self.measured * irradiance)
         below = self._sum_by_element @ (self.weights[:, None] * irradiance**2)
         return np.clip((above / np.maximum(below, 1e-9))[self._nearest_seen], 1e-4, 1.0)
 
@@ -178,4 +214,5 @@ class MaterialFitting:
             irradiance,
             self.scatter,
             np.sqrt(variance),
+            self.gloss,
         )

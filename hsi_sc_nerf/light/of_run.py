@@ -141,7 +141,7 @@ def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"], known: K
         )
     turning = turning_elements(elements, poses[:, :3, :3], SMOOTHING_M, LIFT_M)
     light = light_on_object(elements, turning, views, white_normal, known)
-    covariance, evidence = light.fit.covariance, shading_evidence(turning, views, light.spectral)
+    covariance, evidence = light.fit.covariance, shading_evidence(turning, light.views, light.spectral)
     stationary = KnownLight(light.spectral.light, covariance, centre_m, wavelengths_nm)
     return RunLight(run, light, stationary, evidence, renders, mesh)
 
@@ -192,7 +192,7 @@ def shading_evidence(elements: TurningElements, views: ElementViews, fit: LightF
 
     Args:
         elements: that were measured.
-        views: their measurements, by the same bands as the fit.
+        views: their measurements without gloss, by the same bands as the fit.
         fit: light and materials.
     """
     rows = np.flatnonzero(views.shows_light)

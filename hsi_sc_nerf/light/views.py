@@ -15,6 +15,8 @@ from hsi_sc_nerf.light.stationary_light import LOBE_WIDTH_RAD, StationaryLight, 
 RAYS_AT_ONCE = 1 << 21
 BOUNCES = 4
 """Diffuse reflections between elements that are followed."""
+SMALLEST = 1e-3
+"""Reflectance that noise does not exceed."""
 LEAST_COSINE = 0.15
 """Lamps at grazing angles hardly light a surface, however near they are."""
 CELLS_ACROSS = 4
@@ -194,8 +196,11 @@ class TurningElements:
 
     def facing(self, views: ElementViews) -> Int[np.ndarray, "m"]:
         """The cell of normals in the camera's frame that each measurement lies in."""
-        normals = np.einsum("mk,mkj->mj", self.normals[views.element], self.rotations[views.frame])
-        return _cell_numbers(normals / FACING_SIDE)
+        return _cell_numbers(self.normals_in_camera(views) / FACING_SIDE)
+
+    def normals_in_camera(self, views: ElementViews) -> Float[np.ndarray, "m 3"]:
+        """The normal of each measurement in the camera's frame."""
+        return np.einsum("mk,mkj->mj", self.normals[views.element], self.rotations[views.frame])
 
     @cached_property
     def _harmonics(self) -> list[Float[np.ndarray, "directions terms"]]:

@@ -1,0 +1,133 @@
+"""Light that a glossy skin mirrors, in addition to what its material reflects.
+
+Highlights of the lamps move over the turning object, and depend on the normal in the camera's frame. Over all
+directions that are mirrored into the camera, their radiance sums to the mirrored fraction times the lamps'
+irradiance: so the highlights tell how much the skin mirrors. The same fraction of the chamber's light is mirrored in
+all views alike, which the views could not tell from the material.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import map_coordinates
+
+from hsi_sc_nerf.findings import CERTAIN
+from hsi_sc_nerf.geometry.camera import unit_vectors
+from hsi_sc_nerf.light.shared_errors import CORRELATED
+from hsi_sc_nerf.light.stationary_light import StationaryLight, harmonics
+
+CELL = 0.08
+"""Side of the highlights' cells in x and y of the unit normal: 5 degrees for a surface that faces the camera."""
+HALF = int(np.ceil(1.0 / CELL))
+LEAST_MEASUREMENTS = 5
+"""Number of measurements of a cell whose median counts."""
+HIGHLIGHT_RAD = 0.45
+"""Radius of a lamp's highlight in normals: a rough skin before a lamp of 15 degrees has one of 0.35."""
+LEAST_REFLECTANCE = 0.003
+"""A skin that mirrors less changes no result."""
+HIGHLIGHT_ERROR, CHAMBER_ERROR = 0.3, 0.3
+"""Relative errors of a highlight at one point, and of the chamber's light that is mirrored there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Gloss:
+    """The gloss of an object.
+
+    Attributes:
+        reflectance: fraction of the light that is mirrored, 0 to 1.
+        std: standard deviation of it.
+        highlights: what the lamps' highlights add to the reflectance, by y and x of the normal in the camera's frame
+            in cells of `CELL`; 0 where there are none.
+    """
+
+    reflectance: float
+    std: float
+    highlights: Float[np.ndarray, "side side"]
+
+    def at(
+        self, normals: Float[np.ndarray, "n 3"], light: StationaryLight
+    ) -> tuple[Float[np.ndarray, "n bands"], Float[np.ndarray, "n"]]:
+        """What gloss adds to the reflectance where a surface has these normals.
+
+        Args:
+            normals: unit vectors, camera's frame.
+            light: the light of the chamber and the lamps' colour.
+
+        Returns:
+            The addition, and the standard deviation of its mean over the bands.
+        """
+        chamber, highlight = self.reflectance * mirrored_chamber(normals, light), self.highlight(normals)
+        bands = chamber[:, None] * light.chamber_colour + highlight[:, None] * light.lamp_colour
+        return bands, np.hypot(CHAMBER_ERROR * chamber, HIGHLIGHT_ERROR * highlight)
+
+    def highlight(self, normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """What the lamps add, interpolated between the cells."""
+        column, line = normals[:, :2].T / CELL + HALF - 0.5
+        return map_coordinates(self.highlights, [line, column], order=1, mode="nearest")
+
+
+def find_gloss(
+    normals: Float[np.ndarray, "m 3"], residuals: Float[np.ndarray, "m"], light: StationaryLight
+) -> Gloss | None:
+    """The gloss that explains what material and chamber leave of the measurements, or None.
+
+    Args:
+        normals: of the measured points of the object, unit vectors in the camera's frame.
+        residuals: measured reflectance less that of the material under its irradiance and less the mirrored light of
+            the chamber, means over the bands.
+        light: with the lamps whose highlights are looked for.
+
+    Example:
+        >>> gloss = find_gloss(normals, (measured - material * irradiance).mean(axis=1), light)
+        >>> 0.0 if gloss is None else gloss.reflectance
+    """
+    if not len(light.lamps):
+        return None
+    medians = _cell_medians(_cells(normals), residuals)
+    in_highlights, known = _near_highlights(light), np.isfinite(medians)
+    if not (known & in_highlights).any() or not (known & ~in_highlights).any():
+        return None
+    highlights = np.where(known & in_highlights, medians, 0.0)
+    # A normal's x and y turn by half of what the mirrored direction turns: dw = 4 cos dn, and dn = dx dy / cos.
+    unit = 4.0 * CELL**2 / (np.pi * float(light.lamps.sum()))
+    errors = medians[known & ~in_highlights]
+    reflectance = unit * float(highlights.sum())
+    std = unit * float(errors.std() * np.sqrt(CORRELATED * (known & in_highlights).sum()))
+    if reflectance < max(LEAST_REFLECTANCE, CERTAIN * std):
+        return None
+    return Gloss(reflectance, std, np.maximum(highlights, 0.0))
+
+
+def mirrored_chamber(normals: Float[np.ndarray, "n 3"], light: StationaryLight) -> Float[np.ndarray, "n"]:
+    """Radiance of the chamber in the direction that a perfect mirror shows to the camera, without its colour."""
+    directions = 2.0 * normals[:, 2:] * normals - np.array([0.0, 0.0, 1.0])
+    return np.maximum(harmonics(directions) @ light.chamber, 0.0)
+
+
+def _cells(normals: Float[np.ndarray, "m 3"]) -> Int[np.ndarray, "m"]:
+    column, line = np.clip(np.floor(normals[:, :2].T / CELL).astype(int) + HALF, 0, 2 * HALF - 1)
+    return line * 2 * HALF + column
+
+
+def _cell_medians(cells: Int[np.ndarray, "m"], values: Float[np.ndarray, "m"]) -> Float[np.ndarray, "side side"]:
+    """Median of the values in each cell; NaN where there are few."""
+    medians = np.full((2 * HALF) ** 2, np.nan)
+    order = np.argsort(cells, kind="stable")
+    found, first, count = np.unique(cells[order], return_index=True, return_counts=True)
+    for cell, start, number in zip(found, first, count, strict=True):
+        if number >= LEAST_MEASUREMENTS:
+            medians[cell] = np.median(values[order[start : start + number]])
+    return medians.reshape(2 * HALF, 2 * HALF)
+
+
+def _near_highlights(light: StationaryLight) -> Bool[np.ndarray, "side side"]:
+    """Cells whose normals lie near one that mirrors a lamp into the camera."""
+    middles = (np.arange(2 * HALF) - HALF + 0.5) * CELL
+    x, y = np.meshgrid(middles, middles)
+    square = 1.0 - x**2 - y**2
+    normals = np.stack([x, y, np.sqrt(np.maximum(square, 0.0))], axis=-1)
+    mirrors = unit_vectors(light.to_lamps + np.array([0.0, 0.0, 1.0]))
+    return ((normals @ mirrors.T).max(axis=-1) > np.cos(HIGHLIGHT_RAD)) & (square > 0.0)
