@@ -28,7 +28,6 @@ from open3d.core import Tensor
 from paper_tables import mean_and_deviation
 from path_traced_scene import PathTracedScene, material_reflectance, tarp_reflectance
 from results_table import RESULTS, write_results
-from scipy.ndimage import gaussian_filter
 from session_mistakes import measured_errors
 from true_object import relative_rms
 
@@ -72,8 +71,8 @@ COLUMNS: dict[str, int] = {
 """Columns of the table and their decimals."""
 THRESHOLDS_M = {"F at 2 mm, %": 0.002, "F at 1 mm, %": 0.001, "F at 0.5 mm, %": 0.0005}
 NOISE_FREE_RAYS = 2048
-WHITE_BLUR_PX = 6.0
-"""Sigma over which the rendered tarp is averaged: its light is smooth, its weave and the paths' noise are not."""
+TARP_BRIGHTNESS = 0.5
+"""The tarp is brighter than this part of the image's 99th percentile; a session's white is its mean."""
 POINTS = 300_000
 FRONTAL_DEG = 65.0
 SPOTS, SPOT_RADIUS_M = 200, 0.005
@@ -149,11 +148,13 @@ class PathTracedAccuracy:
         return PathTracedScene(NODES_NM, self.size, NOISE_FREE_RAYS, self.fruit, sampler="multijitter", seed=77)
 
     def _noise_free(self, capture: str) -> Float[np.ndarray, "h w 204"]:
-        """Reflectance of a capture without the noise of paths and sensor."""
+        """Reflectance of a capture without the noise of paths and sensor, by the mean white of the whole tarp."""
         mixing = mixing_matrix()
         path, white_path = (self.folder / f"noise-free-{name}.npy" for name in (capture, "tarp"))
         if not white_path.is_file():
-            np.save(white_path, gaussian_filter(self._scene.tarp(1000), (WHITE_BLUR_PX, WHITE_BLUR_PX, 0)))
+            image = self._scene.tarp(1000)
+            brightness = image.mean(axis=-1)
+            np.save(white_path, image[brightness > TARP_BRIGHTNESS * np.percentile(brightness, 99.0)].mean(axis=0))
         if not path.is_file():
             truth = read_json(self.session / "truth" / "truth.json", "render the session again")
             number, angle_deg = next(

@@ -60,6 +60,9 @@ class MaterialCommand:
     the camera's picture, negative towards the left. Not used with --light, whose session had its own."""
     white_elevation_deg: float = between(-90.0, 90.0, default=0.0)
     """The same above the optical axis of the camera."""
+    white_height_m: float | None = between(-0.5, 2.0, default=None)
+    """Height over the disc at which the white reference was held, on the turntable's axis, metres. It matters where
+    lamps are near. None takes the height at which the camera looks. Not used with --light."""
 
     def main(self, run: TrainedRun | None = None) -> None:
         """Run the command.
@@ -88,7 +91,7 @@ class MaterialCommand:
         if run is None:
             run = open_trained_run(self.load_config)
         require_bands_of_run(cloud, run.model.wavelengths_nm, str(self.cloud))
-        found = light_of_run(run, self._white_normal(), known)
+        found = light_of_run(run, self._white_normal(), known, self.white_height_m)
         corrected = self.correct == "always" or (self.correct == "auto" and found.evidence.shaded)
         result = with_material(cloud, found, run.model.wavelengths_nm, corrected=corrected)
         told = light_summary(found, result, corrected=corrected, light_from=self.light)

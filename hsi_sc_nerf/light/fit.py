@@ -25,6 +25,7 @@ from hsi_sc_nerf.light.stationary_light import (
     StationaryLight,
     even_chamber,
     even_directions,
+    relative_nearness,
     tangents,
     unit_irradiance,
 )
@@ -55,6 +56,8 @@ LAMP_STD, TURN_STD_RAD, NEARNESS_STD = 1.0, 1.0, 1.5
 """Expected size of a lamp, of a correction of its direction, and of one over the lamps' distance (1/m)."""
 WHITE_STD = 0.01
 """Error of the white reference's own reflectance and orientation."""
+WHITE_PLACE_STD_M = 0.02
+"""Error of the place at which it was captured."""
 COLOUR_STD = 0.3
 """Expected scatter of the lamps' colour from the white reference's light."""
 LEAST_LAMPS = 0.05
@@ -66,15 +69,21 @@ SETTLED = 0.01
 LARGEST_TURN_RAD = 0.2
 
 
-def fit_light(elements: TurningElements, views: ElementViews, white_normal: Float[np.ndarray, "3"]) -> LightFit:
+def fit_light(
+    elements: TurningElements,
+    views: ElementViews,
+    white_normal: Float[np.ndarray, "3"],
+    white_m: Float[np.ndarray, "3"] | None = None,
+) -> LightFit:
     """Fit light and materials.
 
     Args:
         elements: that were measured.
         views: their measurements.
         white_normal: outward unit normal of the white reference, camera's frame.
+        white_m: its place relative to the elements' origin, camera's frame; None for that origin.
     """
-    fit = _LightFitting(elements, views, white_normal)
+    fit = _LightFitting(elements, views, white_normal, np.zeros(3) if white_m is None else white_m)
     fit.converge()
     while len(fit.light.lamps) < MOST_LAMPS:
         before = fit.state()
@@ -100,9 +109,11 @@ def fit_light(elements: TurningElements, views: ElementViews, white_normal: Floa
 class _LightFitting(MaterialFitting):
     """State of the fit: the light, and what follows from it."""
 
-    def __init__(self, elements: TurningElements, views: ElementViews, white: np.ndarray) -> None:
+    def __init__(
+        self, elements: TurningElements, views: ElementViews, white: np.ndarray, white_m: np.ndarray
+    ) -> None:
         super().__init__(elements, views, even_chamber(views.reflectance.shape[1]))
-        self.white = white
+        self.white, self.white_m = white, white_m
         self.errors = SharedErrors(elements.cells[views.element])
         self.unevenness = UNEVENNESS_AT_FIRST
 
@@ -188,14 +199,20 @@ class _LightFitting(MaterialFitting):
         if lamps:
             now[-1] = light.nearness
         of_chamber, of_lamps = unit_irradiance(self.white, light.to_lamps)
+        nearer = relative_nearness(self.white_m[None], self.white[None], light.to_lamps)[0]
+        factors = 1.0 + light.nearness * nearer
         white = np.zeros(len(precision))
-        white[:TERMS], white[TERMS : TERMS + lamps] = of_chamber, of_lamps
+        white[:TERMS], white[TERMS : TERMS + lamps] = of_chamber, of_lamps * factors
         # A lamp that turns gives the white reference another light.
-        lit = light.lamps * (light.to_lamps @ self.white > 0.0)
+        lit = light.lamps * factors * (light.to_lamps @ self.white > 0.0)
         white[TERMS + lamps : TERMS + 3 * lamps] = (lit[:, None] * (tangents(light.to_lamps) @ self.white)).ravel()
-        missing = 1.0 - of_chamber @ light.chamber - of_lamps @ light.lamps
-        outer = np.outer(white, white) / WHITE_STD**2
-        return np.diag(precision) + outer, white * missing / WHITE_STD**2 - precision * now
+        by_lamps = float(of_lamps * factors @ light.lamps)
+        if lamps:
+            white[-1] = of_lamps * nearer @ light.lamps
+        missing = 1.0 - of_chamber @ light.chamber - by_lamps
+        # The light of a near lamp changes with the place twice as fast as the distance.
+        std = np.hypot(WHITE_STD, 2.0 * light.nearness * by_lamps * WHITE_PLACE_STD_M)
+        return np.diag(precision) + np.outer(white, white) / std**2, white * missing / std**2 - precision * now
 
     def _move(self, step: np.ndarray) -> None:
         """Change the parameters; lamps stay positive, and turn by no more than ``LARGEST_TURN_RAD`` at once."""
@@ -229,7 +246,7 @@ class _LightFitting(MaterialFitting):
     def _estimate_colours(self) -> None:
         """The colour of the lamps that fits each band best; the white reference stays white."""
         light = self.light
-        of_chamber, of_lamps = light.on(self.white)
+        of_chamber, of_lamps = light.on(self.white, self.white_m)
         if of_lamps < LEAST_LAMPS * (of_chamber + of_lamps):
             return
         irradiance = self.irradiance()

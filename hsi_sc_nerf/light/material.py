@@ -22,6 +22,8 @@ BAND_GROUPS = 8
 """The light is fitted to this number of means of neighbouring bands: its colours are smooth."""
 NEIGHBOURS = 4
 """Number of elements over which the irradiance at a point is averaged."""
+LEAST_SIDEWAYS = 0.1
+"""Square of the sine between the optical axis and the turntable's: 18 degrees."""
 UNEXPLAINED = 2.0
 """Error of irradiance relative to the scatter: the model's errors in single views do not average out."""
 
@@ -118,6 +120,28 @@ def centre_in_camera(elements: Elements, camera_to_object: Float[np.ndarray, "fr
     return np.einsum("fkj,fk->fj", rotations, centre_m - eyes_m).mean(axis=0)
 
 
+def white_place(
+    centre_m: Float[np.ndarray, "3"], camera_to_object: Float[np.ndarray, "frames 4 4"], height_m: float | None
+) -> Float[np.ndarray, "3"]:
+    """Where the white reference was captured, on the turntable's axis: relative to the object, in the camera's frame.
+
+    Args:
+        centre_m: the object's centre, camera's frame.
+        camera_to_object: poses of the frames, metres.
+        height_m: over the disc; None for where the camera's optical axis passes that of the turntable. A camera that
+            looks down along it shows no such height, and gives the object's centre.
+    """
+    eyes_m, forward = camera_to_object[:, :3, 3], -camera_to_object[:, :3, 2]
+    if height_m is None:
+        sideways = (forward[:, :2] ** 2).sum(axis=1)
+        if sideways.mean() < LEAST_SIDEWAYS:
+            return np.zeros(3)
+        along_m = -(eyes_m[:, :2] * forward[:, :2]).sum(axis=1) / sideways
+        height_m = float(np.median(eyes_m[:, 2] + along_m * forward[:, 2]))
+    on_axis_m = np.array([0.0, 0.0, height_m])
+    return np.einsum("fkj,fk->fj", camera_to_object[:, :3, :3], on_axis_m - eyes_m).mean(axis=0) - centre_m
+
+
 def turning_elements(
     elements: Elements, rotations: Float[np.ndarray, "frames 3 3"], pixel_m: float, lift_m: float
 ) -> TurningElements:
@@ -145,6 +169,7 @@ def light_on_object(
     views: ElementViews,
     white_normal: Float[np.ndarray, "3"],
     known: KnownLight | None = None,
+    white_m: Float[np.ndarray, "3"] | None = None,
 ) -> ObjectLight:
     """Fit the light to groups of bands, and interpolate it to all bands.
 
@@ -155,13 +180,14 @@ def light_on_object(
         white_normal: outward unit normal of the white reference, camera's frame.
         known: light that is taken as it is, at the object's centre and the bands of the views. Only the materials are
             found.
+        white_m: place of the white reference relative to the object's centre, camera's frame; None for that centre.
     """
     bands = views.reflectance.shape[1]
     groups = np.array_split(np.arange(bands), min(BAND_GROUPS, bands))
     means = np.stack([views.reflectance[:, group].mean(axis=1) for group in groups], axis=-1)
     grouped = replace(views, reflectance=means)
     if known is None:
-        fit = fit_light(turning, grouped, white_normal)
+        fit = fit_light(turning, grouped, white_normal, white_m)
     else:
         of_chamber, of_lamps = (
             np.array([colour[group].mean() for group in groups])

@@ -18,7 +18,13 @@ from hsi_sc_nerf.findings import CERTAIN
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.light.elements import observe_elements, spread_elements, support_mesh
 from hsi_sc_nerf.light.known_light import KnownLight
-from hsi_sc_nerf.light.material import ObjectLight, centre_in_camera, light_on_object, turning_elements
+from hsi_sc_nerf.light.material import (
+    ObjectLight,
+    centre_in_camera,
+    light_on_object,
+    turning_elements,
+    white_place,
+)
 from hsi_sc_nerf.light.material_fit import LightFit
 from hsi_sc_nerf.light.views import ElementViews, TurningElements
 from hsi_sc_nerf.models.trained_run import TrainedRun
@@ -92,12 +98,18 @@ class RunLight:
         return frames.cpu().numpy(), xy_px.cpu().numpy(), normals
 
 
-def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"], known: KnownLight | None = None) -> RunLight:
+def light_of_run(
+    run: TrainedRun,
+    white_normal: Float[np.ndarray, "3"],
+    known: KnownLight | None = None,
+    white_height_m: float | None = None,
+) -> RunLight:
     """Fit the light on the object of a run.
 
     Args:
         white_normal: outward unit normal of the white reference, camera's frame (OpenGL axes).
         known: light of another session in the same chamber, which is taken instead; the white reference is its own.
+        white_height_m: height of the white reference over the disc, on its axis; None for where the camera looks.
 
     Raises:
         InputError: the run holds no object, no frame sees enough of it, or the known light has other bands.
@@ -140,7 +152,8 @@ def light_of_run(run: TrainedRun, white_normal: Float[np.ndarray, "3"], known: K
             "too few pixels of the object fit its surface; look at masks and poses in the dataset's report."
         )
     turning = turning_elements(elements, poses[:, :3, :3], SMOOTHING_M, LIFT_M)
-    light = light_on_object(elements, turning, views, white_normal, known)
+    white_m = white_place(centre_m, poses, white_height_m)
+    light = light_on_object(elements, turning, views, white_normal, known, white_m)
     covariance, evidence = light.fit.covariance, shading_evidence(turning, light.views, light.spectral)
     stationary = KnownLight(light.spectral.light, covariance, centre_m, wavelengths_nm)
     return RunLight(run, light, stationary, evidence, renders, mesh)

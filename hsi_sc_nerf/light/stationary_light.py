@@ -25,6 +25,9 @@ LOBE_WIDTH_RAD = 0.055
 """Standard deviation of a lobe: that of a lamp of 22 cm at 1 m, and the distance between the rays' directions. A
 wider lobe lights beyond the terminator, which the fit makes up for by a stronger lamp (docs/validation/light.md)."""
 
+LEAST_COSINE = 0.15
+"""Lamps at grazing angles hardly light a surface, however near they are."""
+
 
 @dataclass(frozen=True, eq=False)
 class StationaryLight:
@@ -46,10 +49,11 @@ class StationaryLight:
     chamber_colour: Float[np.ndarray, "bands"]
     lamp_colour: Float[np.ndarray, "bands"]
 
-    def on(self, normal: Float[np.ndarray, "3"]) -> tuple[float, float]:
-        """Irradiance by chamber and lamps, without their colours, on an unoccluded surface at the centre."""
+    def on(self, normal: Float[np.ndarray, "3"], position_m: Float[np.ndarray, "3"]) -> tuple[float, float]:
+        """Irradiance by chamber and lamps, without their colours, on an unoccluded surface near the centre."""
         of_chamber, of_lamps = unit_irradiance(normal, self.to_lamps)
-        return float(of_chamber @ self.chamber), float(of_lamps @ self.lamps)
+        nearer = relative_nearness(position_m[None], normal[None], self.to_lamps)[0]
+        return float(of_chamber @ self.chamber), float(of_lamps * (1.0 + self.nearness * nearer) @ self.lamps)
 
 
 def even_chamber(bands: int) -> StationaryLight:
@@ -105,3 +109,16 @@ def tangents(towards: Float[np.ndarray, "lamps 3"]) -> Float[np.ndarray, "lamps 
     helper = np.eye(3)[np.abs(towards).argmin(axis=1)]
     first = unit_vectors(np.cross(towards, helper))
     return np.stack([first, np.cross(towards, first)], axis=1)
+
+
+def relative_nearness(
+    positions: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], to_lamps: Float[np.ndarray, "lamps 3"]
+) -> Float[np.ndarray, "n lamps"]:
+    """Relative change of each lamp's irradiance with the lamps' nearness, m.
+
+    At a place x the direction w of a lamp at the distance 1 / nearness becomes w - nearness (x - (x w) w), and its
+    irradiance on a surface that faces it 1 + 2 nearness (x w) times that at the centre, to first order.
+    """
+    cosines = np.maximum(normals @ to_lamps.T, LEAST_COSINE)
+    outwards = (positions * normals).sum(axis=1, keepdims=True)
+    return 3.0 * positions @ to_lamps.T - outwards / cosines

@@ -10,15 +10,20 @@ import scipy.sparse
 from jaxtyping import Bool, Float, Int
 
 from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene
-from hsi_sc_nerf.light.stationary_light import LOBE_WIDTH_RAD, StationaryLight, harmonics, lobes, tangents
+from hsi_sc_nerf.light.stationary_light import (
+    LOBE_WIDTH_RAD,
+    StationaryLight,
+    harmonics,
+    lobes,
+    relative_nearness,
+    tangents,
+)
 
 RAYS_AT_ONCE = 1 << 21
 BOUNCES = 4
 """Diffuse reflections between elements that are followed."""
 SMALLEST = 1e-3
 """Reflectance that noise does not exceed."""
-LEAST_COSINE = 0.15
-"""Lamps at grazing angles hardly light a surface, however near they are."""
 CELLS_ACROSS = 4
 """Cells across the object; elements in one of them share errors of mesh and poses."""
 FACING_SIDE = 0.35
@@ -151,7 +156,7 @@ class TurningElements:
         weights, to_lamps = self.transfer.open_weights, light.to_lamps @ self.rotations[frame].T
         chamber = weights @ (self._harmonics[frame] @ light.chamber).astype(np.float32)
         lamps = weights @ lobes(self.directions, to_lamps).astype(np.float32)
-        lamps = lamps * (1.0 + light.nearness * _nearness(self.positions, self.normals, to_lamps))
+        lamps = lamps * (1.0 + light.nearness * relative_nearness(self.positions, self.normals, to_lamps))
         return chamber[:, None] * light.chamber_colour + (lamps @ light.lamps)[:, None] * light.lamp_colour
 
     def bounced(
@@ -183,7 +188,7 @@ class TurningElements:
             slope = np.einsum("ltk,dk->dlt", along, self.directions) / LOBE_WIDTH_RAD**2
             columns = np.hstack([radiance, (radiance[..., None] * slope).reshape(len(radiance), -1)])
             units[rows, : 3 * lamps] = self.transfer.open_weights[seen] @ columns.astype(np.float32)
-            units[rows, 3 * lamps :] = _nearness(self.positions[seen], self.normals[seen], there)
+            units[rows, 3 * lamps :] = relative_nearness(self.positions[seen], self.normals[seen], there)
         irradiance = units[:, :lamps]
         by_direction = units[:, lamps : 3 * lamps].reshape(count, lamps, 2)
         return LampUnits(irradiance, by_direction, irradiance * units[:, 3 * lamps :])
@@ -214,16 +219,3 @@ def _cell_numbers(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
 
 def _by_frame(views: ElementViews) -> list[tuple[int, Int[np.ndarray, "rows"]]]:
     return [(int(frame), np.flatnonzero(views.frame == frame)) for frame in np.unique(views.frame)]
-
-
-def _nearness(
-    positions: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], to_lamps: Float[np.ndarray, "lamps 3"]
-) -> Float[np.ndarray, "n lamps"]:
-    """Relative change of each lamp's irradiance with the lamps' nearness, m.
-
-    At a place x the direction w of a lamp at the distance 1 / nearness becomes w - nearness (x - (x w) w), and its
-    irradiance on a surface that faces it 1 + 2 nearness (x w) times that at the centre, to first order.
-    """
-    cosines = np.maximum(normals @ to_lamps.T, LEAST_COSINE)
-    outwards = (positions * normals).sum(axis=1, keepdims=True)
-    return 3.0 * positions @ to_lamps.T - outwards / cosines

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from light_on_a_ball import FACING, measured, turning_ball
+from light_on_a_ball import FACING, TO_LAMP, measured, turning_ball
 
 from hsi_sc_nerf.light.fit import fit_light
 
@@ -68,3 +68,19 @@ def test_a_near_lamp_is_found_to_be_near():
         assert found.light.nearness == pytest.approx(1.0 / distance_m, abs=0.4)
         ratio = (found.material / material)[seen_rows(views, parts)]
         assert np.quantile(np.abs(ratio - 1.0), 0.9) < 0.05
+
+
+@pytest.mark.slow
+def test_a_white_below_the_object_got_less_of_a_near_lamp():
+    parts = turning_ball(centres_m=np.random.default_rng(3).uniform(-0.06, 0.06, (300, 3)))
+    views, _, material = measured(parts, 0.5, noise=0.002, distance_m=0.6)
+    place_m = np.array([0.0, -0.07, 0.0])
+    to_lamp = 0.6 * TO_LAMP - place_m
+    on_white = 0.5 + 0.5 * (FACING @ to_lamp) * 0.6**2 / np.linalg.norm(to_lamp) ** 3
+    views = replace(views, reflectance=views.reflectance * (0.5 + 0.5 * TO_LAMP[2]) / on_white)
+    seen = seen_rows(views, parts)
+    errors = [
+        np.median((fit_light(parts, views, FACING, place).material / material)[seen]) - 1.0
+        for place in (place_m, None)
+    ]
+    assert abs(errors[0]) < 0.02 < 0.05 < errors[1]
