@@ -21,6 +21,7 @@ from hsi_sc_nerf.export.formats import write_cloud
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.geometry.camera import pixel_rays
 from hsi_sc_nerf.light.fit import fit_light
+from hsi_sc_nerf.light.gloss import HALF, Gloss
 from hsi_sc_nerf.light.known_light import read_light
 from hsi_sc_nerf.light.of_run import RunLight, light_of_run, shading_evidence
 from hsi_sc_nerf.models.trained_run import open_trained_run
@@ -106,6 +107,29 @@ def test_a_lamp_on_a_run_is_found_and_divided_out(lit):
     assert told["shaded"] is True
     assert told["relative_std"] == pytest.approx(np.median(std / by_band.mean(axis=1)), rel=1e-4)
     assert told["support_unknown"] is True
+
+
+@pytest.mark.slow
+def test_gloss_is_taken_off_before_the_light_and_has_a_column(lit):
+    gloss = Gloss(0.04, 0.002, np.zeros((2 * HALF, 2 * HALF)))
+    glossy = replace(lit, light=replace(lit.light, fit=replace(lit.light.fit, gloss=gloss)))
+    cloud = upper_cloud(lit, lit=True)
+    matte, corrected = (
+        with_material(cloud, found, factory.WAVELENGTHS_NM, corrected=True) for found in (lit, glossy)
+    )
+    assert list(corrected.extra)[-1] == "gloss"
+    # An even chamber that gives a part of the light is mirrored alike everywhere.
+    chamber = lit.stationary.light.chamber[0]
+    np.testing.assert_allclose(corrected.extra["gloss"], 0.04 * chamber, rtol=0.3)
+    names = list(matte.extra)[: factory.BANDS]
+    less, more = (np.stack([each.extra[name] for name in names], axis=-1) for each in (corrected, matte))
+    expected = more.mean(axis=1) - corrected.extra["gloss"] / corrected.extra["irradiance"]
+    np.testing.assert_allclose(less.mean(axis=1), expected, rtol=0.02)
+    assert (corrected.extra["irradiance_std"] > matte.extra["irradiance_std"]).all()
+    told = light_summary(glossy, corrected, corrected=True)
+    assert told["gloss"] == {"reflectance": 0.04, "std": 0.002}
+    assert "mirrors 4.0 ± 0.2 %" in sentences(told)[1]
+    assert light_summary(lit, matte, corrected=True)["gloss"] is None
 
 
 @pytest.mark.slow
