@@ -24,9 +24,10 @@ import trimesh
 import tyro
 from independent_session import BANDS, NODES_NM, IndependentSession, mixing_matrix
 from jaxtyping import Float
+from matplotlib.figure import Figure
 from open3d.core import Tensor
 from paper_tables import mean_and_deviation
-from path_traced_scene import PathTracedScene, material_reflectance, tarp_reflectance
+from path_traced_scene import PathTracedScene, camera_pose, material_reflectance, tarp_reflectance
 from results_table import RESULTS, write_results
 from session_mistakes import measured_errors
 from true_object import relative_rms
@@ -100,6 +101,8 @@ class PathTracedAccuracy:
     """More words for the training; they are part of the row's name."""
     results: Path = RESULTS
     """Folder of the CSV file."""
+    picture: Path | None = None
+    """Where to draw the brightness of the first seed's cloud relative to the skin's."""
 
     def main(self) -> None:
         """Do what is missing, print the table, write it."""
@@ -112,6 +115,8 @@ class PathTracedAccuracy:
         seeds = f"scene, runs {' '.join(map(str, self.seeds))}"
         titles = ["fruit", "training", *COLUMNS]
         write_results("path_traced_accuracy", titles, [row], keys=2, seed=seeds, folder=self.results)
+        if self.picture is not None:
+            self._draw(self._out(self.seeds[0]), self.picture)
 
     @property
     def folder(self) -> Path:
@@ -123,10 +128,14 @@ class PathTracedAccuracy:
         """The path-traced session."""
         return self.folder / "session"
 
+    def _out(self, seed: int) -> Path:
+        """Folder of one run."""
+        words = "".join(letter if letter.isalnum() else "_" for letter in self.words)
+        return self.folder / f"{self.preset}{words}-{seed}"
+
     def _judged(self, seed: int) -> dict[str, float]:
         """Figures of one run."""
-        words = "".join(letter if letter.isalnum() else "_" for letter in self.words)
-        out = self.folder / f"{self.preset}{words}-{seed}"
+        out = self._out(seed)
         kept = out / "judged.json"
         if not kept.is_file():
             train = f"--machine.seed {seed} {self.words}".strip()
@@ -136,12 +145,16 @@ class PathTracedAccuracy:
 
     def _figures(self, out: Path) -> dict[str, float]:
         run = open_trained_run(out / "training" / "hsi-sc-nerf" / "run" / "config.yml")
-        cloud = read_spectral_ply(out / "point_cloud.ply")
-        corrected = out / "point_cloud-material.ply"
-        material = material_spectra(read_spectral_ply(corrected)) if corrected.is_file() else None
+        cloud, material = self._clouds(out)
         errors = dict(zip(COLUMNS, map(float, measured_errors(out / "data", self.session)[:4]), strict=False))
         figures = errors | self._views(run) | self._surface(run, cloud) | self._sizes(out)
-        return figures | self._brightness(cloud, cloud.spectra if material is None else material)
+        return figures | self._brightness(cloud, material)
+
+    def _clouds(self, out: Path) -> tuple[SpectralCloud, Float[np.ndarray, "n bands"]]:
+        """The cloud of a run, and the material at its points; what was measured where no light was corrected."""
+        cloud, corrected = read_spectral_ply(out / "point_cloud.ply"), out / "point_cloud-material.ply"
+        material = material_spectra(read_spectral_ply(corrected)) if corrected.is_file() else None
+        return cloud, cloud.spectra if material is None else material
 
     @cached_property
     def _scene(self) -> PathTracedScene:
@@ -212,19 +225,22 @@ class PathTracedAccuracy:
             "volume, %": 100.0 * (size["volume_l"] / 1e3 / true["volume"] - 1.0),
         }
 
+    def _true_material(self, cloud: SpectralCloud) -> Float[np.ndarray, "n bands"]:
+        """Reflectance of the skin below its gloss, relative to the tarp's, where the true surface is nearest."""
+        scene = ray_scene(np.asarray(self._mesh.vertices), np.asarray(self._mesh.faces))
+        nearest = scene.compute_closest_points(Tensor(cloud.points.astype(np.float32)))
+        corner = self._mesh.faces[nearest["primitive_ids"].numpy().astype(int)][:, 0]
+        skin = material_reflectance(self._mesh, self._scene.spots, cloud.wavelengths_nm)
+        return (skin / tarp_reflectance(cloud.wavelengths_nm))[corner]
+
     def _brightness(self, cloud: SpectralCloud, material: Float[np.ndarray, "n bands"]) -> dict[str, float]:
         """Brightness of frontal points relative to the skin's, as measured and as the material's; spots of 10 mm."""
         frontal = np.flatnonzero(cloud.extra[INCIDENCE] < FRONTAL_DEG)
-        scene = ray_scene(np.asarray(self._mesh.vertices), np.asarray(self._mesh.faces))
-        nearest = scene.compute_closest_points(Tensor(cloud.points[frontal].astype(np.float32)))
-        corner = self._mesh.faces[nearest["primitive_ids"].numpy().astype(int)][:, 0]
-        skin = material_reflectance(self._mesh, self._scene.spots, cloud.wavelengths_nm)
-        true = (skin / tarp_reflectance(cloud.wavelengths_nm))[corner]
-        measured, corrected = cloud.spectra[frontal], material[frontal]
-        apparent, bright = (spectra.mean(axis=1) / true.mean(axis=1) for spectra in (measured, corrected))
+        cloud, corrected = cloud.select(frontal), material[frontal]
+        true, points = self._true_material(cloud), cloud.points
+        apparent, bright = (spectra.mean(axis=1) / true.mean(axis=1) for spectra in (cloud.spectra, corrected))
         names = ("as measured: 5 %", "50 %", "95 %", "material: 5 %", "median", "95 % of material")
         values = [*np.quantile(apparent, [0.05, 0.5, 0.95]), *np.quantile(bright, [0.05, 0.5, 0.95])]
-        points = cloud.points[frontal]
         centres = points[np.random.default_rng(0).choice(len(points), SPOTS, replace=False)]
         near = (np.linalg.norm(points - centre, axis=1) < SPOT_RADIUS_M for centre in centres)
         spots = [relative_rms(corrected[some].mean(axis=0), true[some].mean(axis=0)) for some in near]
@@ -233,6 +249,25 @@ class PathTracedAccuracy:
             "spots, %": 100.0 * float(np.median(spots)),
             "worst spot, %": 100.0 * max(spots),
         }
+
+    def _draw(self, out: Path, path: Path) -> None:
+        """The brightness of the points that face the first frame, relative to the skin's."""
+        cloud, material = self._clouds(out)
+        camera = camera_pose(0.0)
+        sight = camera[:3, 3] - cloud.points
+        facing = np.flatnonzero((cloud.normals * sight).sum(axis=1) > 0.3 * np.linalg.norm(sight, axis=1))
+        rows = facing[np.argsort(-np.linalg.norm(sight[facing], axis=1))]
+        true = self._true_material(cloud.select(rows)).mean(axis=1)
+        place_cm = 100.0 * (cloud.points[rows] - cloud.points.mean(axis=0)) @ camera[:3, :2]
+        figure = Figure(figsize=(9.0, 4.0), layout="constrained")
+        titles = "as measured", "of the material"
+        for axes, title, spectra in zip(figure.subplots(1, 2), titles, (cloud.spectra, material), strict=True):
+            ratio = spectra[rows].mean(axis=1) / true
+            shown = axes.scatter(*place_cm.T, c=ratio, s=0.6, cmap="RdBu_r", vmin=0.5, vmax=1.5, rasterized=True)
+            axes.set_title(f"brightness {title}, relative to the skin's")
+            axes.set(aspect="equal", xlabel="cm")
+        figure.colorbar(shown, ax=figure.axes)
+        figure.savefig(path, dpi=110)
 
 
 if __name__ == "__main__":

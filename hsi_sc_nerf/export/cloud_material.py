@@ -101,7 +101,8 @@ def with_material(
             added, added_std = mirrored
             material = np.maximum(material - added[:, bands], SMALLEST)
             gloss = {GLOSS: added.mean(axis=1)}
-            std = np.hypot(std, irradiance * added_std / material.mean(axis=1))
+            relative = np.nan_to_num(added_std / material.mean(axis=1))  # 0 for a point without a spectrum
+            std = np.hypot(std, irradiance * relative)
         material = material / by_band[:, bands]
     names = band_property_names(cloud.wavelengths_nm, "material")
     columns = dict(zip([*names, *LIGHT_COLUMNS], [*material.T, irradiance, std], strict=True)) | gloss
