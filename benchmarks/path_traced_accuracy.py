@@ -45,31 +45,21 @@ from hsi_sc_nerf.models.trained_run import TrainedRun, open_trained_run
 from hsi_sc_nerf.simulate.scores import visible_from
 from hsi_sc_nerf.spectra import nearest_bands
 
-COLUMNS: dict[str, int] = {
-    "rotation, deg": 3,
-    "position, mm": 2,
-    "focal length, %": 2,
-    "mask, IoU": 3,
-    "SAM, rad": 4,
-    "RMSE": 4,
-    "noise: SAM, rad": 4,
-    "noise: RMSE": 4,
-    "F at 2 mm, %": 1,
-    "F at 1 mm, %": 1,
-    "F at 0.5 mm, %": 1,
-    "height above the surface, mm": 2,
-    "area, %": 2,
-    "volume, %": 2,
-    "as measured: 5 %": 3,
-    "50 %": 3,
-    "95 %": 3,
-    "material: 5 %": 3,
-    "median": 3,
-    "95 % of material": 3,
-    "spots, %": 1,
-    "worst spot, %": 1,
+COLUMNS: dict[str, dict[str, int]] = {
+    "poses: largest error, deg, mm": {"rotation, deg": 3, "position, mm": 2},
+    "focal length, %": {"focal length, %": 2},
+    "masks: least IoU": {"mask, IoU": 3},
+    "views: SAM, rad, RMSE": {"SAM, rad": 4, "RMSE": 4},
+    "as measured: SAM, rad, RMSE": {"noise: SAM, rad": 4, "noise: RMSE": 4},
+    "F at 2, 1, 0.5 mm, %": {"F at 2 mm, %": 1, "F at 1 mm, %": 1, "F at 0.5 mm, %": 1},
+    "height above the surface, mm": {"height above the surface, mm": 2},
+    "area, volume, %": {"area, %": 1, "volume, %": 1},
+    "brightness as measured: 5, 50, 95 %": {"as measured: 5 %": 2, "50 %": 2, "95 %": 2},
+    "of the material: 5, 50, 95 %": {"material: 5 %": 2, "median": 3, "95 % of material": 2},
+    "spots: median, worst, %": {"spots, %": 1, "worst spot, %": 1},
 }
-"""Columns of the table and their decimals."""
+"""Columns of the table, the figures in each, and their decimals."""
+FIGURES = [name for figures in COLUMNS.values() for name in figures]
 THRESHOLDS_M = {"F at 2 mm, %": 0.002, "F at 1 mm, %": 0.001, "F at 0.5 mm, %": 0.0005}
 NOISE_FREE_RAYS = 2048
 TARP_BRIGHTNESS = 0.5
@@ -109,7 +99,10 @@ class PathTracedAccuracy:
         if not (self.session / "truth" / "mesh.ply").is_file():
             IndependentSession(self.session, self.frames, self.size, self.rays, self.fruit).main()
         found = [self._judged(seed) for seed in self.seeds]
-        cells = [mean_and_deviation([one[name] for one in found], digits) for name, digits in COLUMNS.items()]
+        cells = [
+            ", ".join(mean_and_deviation([one[name] for one in found], digits) for name, digits in figures.items())
+            for figures in COLUMNS.values()
+        ]
         name = f"{self.fruit}, {self.frames} views of {self.size} px"
         row = [name, f"{self.preset} {self.words}".strip(), *cells]
         seeds = f"scene, runs {' '.join(map(str, self.seeds))}"
@@ -146,7 +139,7 @@ class PathTracedAccuracy:
     def _figures(self, out: Path) -> dict[str, float]:
         run = open_trained_run(out / "training" / "hsi-sc-nerf" / "run" / "config.yml")
         cloud, material = self._clouds(out)
-        errors = dict(zip(COLUMNS, map(float, measured_errors(out / "data", self.session)[:4]), strict=False))
+        errors = dict(zip(FIGURES, map(float, measured_errors(out / "data", self.session)[:4]), strict=False))
         figures = errors | self._views(run) | self._surface(run, cloud) | self._sizes(out)
         return figures | self._brightness(cloud, material)
 
