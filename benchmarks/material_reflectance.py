@@ -131,6 +131,7 @@ class Judged:
     evidence: ShadingEvidence
     points: Float[np.ndarray, "n 3"]
     measured: Float[np.ndarray, "n bands"]
+    material: Float[np.ndarray, "n bands"]
     true: Float[np.ndarray, "n bands"]
     irradiance: Float[np.ndarray, "n bands"]
     std: Float[np.ndarray, "n"]
@@ -142,7 +143,7 @@ class Judged:
         evidence, found, std = self.evidence, self.irradiance, self.std
         if not evidence.shaded:
             found, std = np.ones_like(found), np.full(len(std), WHITE_STD)
-        corrected = self.measured / found
+        corrected = self.material if evidence.shaded else self.measured
         bright, apparent = (spectra.mean(axis=1) / self.true.mean(axis=1) for spectra in (corrected, self.measured))
         spots, as_measured = (spot_errors(self.points, spectra, self.true) for spectra in (corrected, self.measured))
         light, relative = self.true_irradiance / found.mean(axis=1), std / found.mean(axis=1)
@@ -212,9 +213,11 @@ def judge_true_mesh(
     point, first = np.unique(seen.element[order], return_index=True)
     best = order[first]
     measured, true = seen.reflectance[best], material.reflectance[best]
-    irradiance, std = found.irradiance(points.positions[point], points.normals[point], seen.frame[best])
+    where = points.positions[point], points.normals[point], seen.frame[best]
+    irradiance, std = found.irradiance(*where)
+    separated = found.material_at(measured, *where, np.arange(measured.shape[1])).spectra
     shown = measured.mean(axis=1) / true.mean(axis=1)
-    return Judged(evidence, points.positions[point], measured, true, irradiance, std, shown, seconds)
+    return Judged(evidence, points.positions[point], measured, separated, true, irradiance, std, shown, seconds)
 
 
 def judge_run(truth: Truth, config: Path, cloud_path: Path, known: KnownLight | None) -> Judged:
@@ -226,8 +229,10 @@ def judge_run(truth: Truth, config: Path, cloud_path: Path, known: KnownLight | 
     frontal = np.flatnonzero(cloud.extra[INCIDENCE] < LARGEST_INCIDENCE_DEG)
     chosen = np.random.default_rng(0).choice(frontal, min(2 * POINTS, len(frontal)), replace=False)
     points = cloud.points[chosen].astype(float)
-    irradiance, std = found.irradiance(points)
-    frames, xy_px, _ = found.frontal(points)
+    frames, xy_px, normals = found.frontal(points)
+    where, measured = (points, normals, np.maximum(frames, 0)), cloud.spectra[chosen]
+    irradiance, std = found.light.irradiance(*where)
+    separated = found.light.material_at(measured, *where, np.arange(measured.shape[1])).spectra
     shown = np.full(len(points), np.nan)
     for index, frame in enumerate(run.manager.train_dataset.frames):
         rows = np.flatnonzero(frames == index)
@@ -238,7 +243,7 @@ def judge_run(truth: Truth, config: Path, cloud_path: Path, known: KnownLight | 
         shown[rows] = radiance[line, sample].mean(axis=1) / material[line, sample].mean(axis=1)
     _, weights, _ = surface.nearest(points)
     true = weights @ surface.endmembers
-    return Judged(found.evidence, points, cloud.spectra[chosen], true, irradiance, std, shown, seconds)
+    return Judged(found.evidence, points, measured, separated, true, irradiance, std, shown, seconds)
 
 
 def frontal_points(elements: Elements, mesh: Mesh) -> Elements:

@@ -25,7 +25,6 @@ from hsi_sc_nerf.export.cloud import (
 )
 from hsi_sc_nerf.light.fit import WHITE_STD
 from hsi_sc_nerf.light.of_run import RunLight
-from hsi_sc_nerf.light.views import SMALLEST
 from hsi_sc_nerf.spectra import SAME_BAND_NM, same_bands
 
 NEIGHBOURS = 4
@@ -94,16 +93,9 @@ def with_material(
     if corrected:
         points_m = cloud.points.astype(float)
         frames, _, normals = found.frontal(points_m)
-        frames = np.maximum(frames, 0)
-        by_band, std = found.light.irradiance(points_m, normals, frames)
-        irradiance, mirrored = by_band.mean(axis=1), found.light.mirrored(normals, frames)
-        if mirrored is not None:
-            added, added_std = mirrored
-            material = np.maximum(material - added[:, bands], SMALLEST)
-            gloss = {GLOSS: added.mean(axis=1)}
-            relative = np.nan_to_num(added_std / material.mean(axis=1))  # 0 for a point without a spectrum
-            std = np.hypot(std, irradiance * relative)
-        material = material / by_band[:, bands]
+        at = found.light.material_at(cloud.spectra, points_m, normals, np.maximum(frames, 0), bands)
+        material, irradiance, std = at.spectra, at.irradiance, at.irradiance_std
+        gloss = {} if at.gloss is None else {GLOSS: at.gloss}
     names = band_property_names(cloud.wavelengths_nm, "material")
     columns = dict(zip([*names, *LIGHT_COLUMNS], [*material.T, irradiance, std], strict=True)) | gloss
     extra = {name: column for name, column in cloud.extra.items() if name not in {*columns, GLOSS}}

@@ -12,12 +12,13 @@ chamber, few lamps, and irradiance 1 on the white reference.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.geometry.camera import unit_vectors
-from hsi_sc_nerf.light.material_fit import GLOSS_STEPS, LightFit, MaterialFitting
+from hsi_sc_nerf.light.material_fit import LightFit, MaterialFitting
 from hsi_sc_nerf.light.shared_errors import CORRELATED, SharedErrors
 from hsi_sc_nerf.light.stationary_light import (
     DEGREE_OF_TERM,
@@ -98,11 +99,7 @@ def fit_light(
     # The chamber explains only what no lamp explains.
     fit.unevenness = UNEVENNESS
     fit.errors = SharedErrors(elements.cells[views.element], elements.facing(views))
-    fit.converge(estimate_unevenness=True)
-    for _ in range(GLOSS_STEPS):
-        if not fit.take_gloss_off():
-            break
-        fit.converge(estimate_unevenness=True)
+    fit.settle_without_gloss(partial(fit.converge, estimate_unevenness=True))
     return fit.result(fit.covariance())
 
 

@@ -18,6 +18,7 @@ from hsi_sc_nerf.findings import CERTAIN
 from hsi_sc_nerf.geometry.camera import unit_vectors
 from hsi_sc_nerf.light.shared_errors import CORRELATED
 from hsi_sc_nerf.light.stationary_light import StationaryLight, harmonics
+from hsi_sc_nerf.light.views import SMALLEST
 
 CELL = 0.08
 """Side of the highlights' cells in x and y of the unit normal: 5 degrees for a surface that faces the camera."""
@@ -62,6 +63,12 @@ class Gloss:
         chamber, highlight = self.reflectance * mirrored_chamber(normals, light), self.highlight(normals)
         bands = chamber[:, None] * light.chamber_colour + highlight[:, None] * light.lamp_colour
         return bands, np.hypot(CHAMBER_ERROR * chamber, HIGHLIGHT_ERROR * highlight)
+
+    def taken_off(
+        self, reflectance: Float[np.ndarray, "n bands"], normals: Float[np.ndarray, "n 3"], light: StationaryLight
+    ) -> Float[np.ndarray, "n bands"]:
+        """Reflectance without what gloss adds where a surface has these normals; at least `SMALLEST`."""
+        return np.maximum(reflectance - self.at(normals, light)[0], SMALLEST)
 
     def highlight(self, normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """What the lamps add, interpolated between the cells."""

@@ -29,6 +29,23 @@ UNEXPLAINED = 2.0
 
 
 @dataclass(frozen=True, eq=False)
+class PointMaterial:
+    """The material at points, and the light that was taken off.
+
+    Attributes:
+        spectra: reflectance of the material.
+        irradiance: relative to that on the white reference, mean over the bands.
+        irradiance_std: relative to the irradiance, the standard deviation of the material's brightness.
+        gloss: what the skin mirrors, as reflectance, mean over the bands; None where no gloss was found.
+    """
+
+    spectra: Float[np.ndarray, "n selected"]
+    irradiance: Float[np.ndarray, "n"]
+    irradiance_std: Float[np.ndarray, "n"]
+    gloss: Float[np.ndarray, "n"] | None
+
+
+@dataclass(frozen=True, eq=False)
 class ObjectLight:
     """Irradiance on an object, and its material.
 
@@ -95,6 +112,32 @@ class ObjectLight:
             return None
         in_camera = np.einsum("nk,nkj->nj", normals, self.turning.rotations[frames])
         return self.fit.gloss.at(in_camera, self.spectral.light)
+
+    def material_at(
+        self,
+        reflectance: Float[np.ndarray, "n selected"],
+        points_m: Float[np.ndarray, "n 3"],
+        normals: Float[np.ndarray, "n 3"],
+        frames: Int[np.ndarray, "n"],
+        bands: Int[np.ndarray, "selected"],
+    ) -> PointMaterial:
+        """The material at points of the object, from what one frame each measured there.
+
+        Args:
+            reflectance: as measured.
+            points_m: object frame.
+            normals: outward unit normals.
+            frames: the frame that measured each point.
+            bands: of the light, at which the reflectance is given.
+        """
+        by_band, std = self.irradiance(points_m, normals, frames)
+        irradiance, mirrored, gloss = by_band.mean(axis=1), self.mirrored(normals, frames), None
+        if mirrored is not None:
+            added, added_std = mirrored
+            gloss, reflectance = added.mean(axis=1), np.maximum(reflectance - added[:, bands], SMALLEST)
+            relative = np.nan_to_num(added_std / reflectance.mean(axis=1))  # 0 for a point without a spectrum
+            std = np.hypot(std, irradiance * relative)
+        return PointMaterial(reflectance / by_band[:, bands], irradiance, std, gloss)
 
     @property
     def _spacing_m(self) -> float:
@@ -204,8 +247,8 @@ def light_on_object(
     entries = fit.weights, (views.element, np.arange(len(views.element)))
     weighted = scipy.sparse.csr_array(entries, shape=(len(elements.positions), len(views.element)))
     if fit.gloss is not None:
-        added = np.where(views.shows_light[:, None], fit.gloss.at(turning.normals_in_camera(views), light)[0], 0.0)
-        views = replace(views, reflectance=np.maximum(views.reflectance - added, SMALLEST))
+        matte = fit.gloss.taken_off(views.reflectance, turning.normals_in_camera(views), light)
+        views = replace(views, reflectance=np.where(views.shows_light[:, None], matte, views.reflectance))
     above, below = weighted @ (views.reflectance * irradiance), weighted @ irradiance**2
     seen = below[:, 0] > 0.0
     material = np.clip(above / np.maximum(below, 1e-9), 1e-4, 1.0)

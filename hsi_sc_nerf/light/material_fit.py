@@ -8,6 +8,7 @@ once it is found (`Gloss`); Tukey's weights leave out what is left of it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,11 +72,7 @@ def materials_under(
         views: their measurements.
     """
     fit = MaterialFitting(elements, views, light)
-    fit.settle()
-    for _ in range(GLOSS_STEPS):
-        if not fit.take_gloss_off():
-            break
-        fit.settle()
+    fit.settle_without_gloss(fit.settle)
     return fit.result(covariance)
 
 
@@ -114,18 +111,31 @@ class MaterialFitting:
             self.weigh(residual)
         self.bounce()
 
+    def settle_without_gloss(self, settle: Callable[[], None]) -> None:
+        """Settle, and again while gloss that is found and taken off changes.
+
+        Args:
+            settle: finds what else is unknown.
+        """
+        settle()
+        for _ in range(GLOSS_STEPS):
+            if not self.take_gloss_off():
+                break
+            settle()
+
     def take_gloss_off(self) -> bool:
         """Find what the skin mirrors under the light of now; False if that is nothing, or as much as before."""
         used, normals = self.views.shows_light, self.elements.normals_in_camera(self.views)
         before = 0.0 if self.gloss is None else self.gloss.reflectance
-        diffuse = self.materials(self.irradiance())[self.views.element] * self.irradiance()
+        irradiance = self.irradiance()
+        diffuse = self.materials(irradiance)[self.views.element] * irradiance
         left = (self.views.reflectance - diffuse).mean(axis=1) - before * mirrored_chamber(normals, self.light)
         found = find_gloss(normals[used], left[used], self.light)
         if found is None:
             return False
         self.gloss = found
-        added = np.where(used[:, None], found.at(normals, self.light)[0], 0.0)
-        self.measured = np.maximum(self.views.reflectance - added, SMALLEST)
+        reflectance = self.views.reflectance
+        self.measured = np.where(used[:, None], found.taken_off(reflectance, normals, self.light), reflectance)
         expected = np.maximum(diffuse.mean(axis=1), SMALLEST)
         self._highlight_std = HIGHLIGHT_ERROR * used * found.highlight(normals) / expected
         return abs(found.reflectance - before) > GLOSS_SETTLED
