@@ -134,9 +134,14 @@ def training_config(method: str, words: Sequence[str]) -> TrainerConfig:
         raise InputError(f"no method is named '{method}'; there are {', '.join(methods)}.")
     default = copy.deepcopy(methods[method])
     complaint = io.StringIO()
+    as_nerfstudio_does = (tyro.conf.SuppressFixed, tyro.conf.FlagConversionOff)
     try:
-        with contextlib.redirect_stderr(complaint), contextlib.redirect_stdout(complaint):
-            return tyro.cli(type(default), default=default, args=words, config=(tyro.conf.FlagConversionOff,))
+        with (
+            contextlib.redirect_stderr(complaint),
+            contextlib.redirect_stdout(complaint),
+            warnings.catch_warnings(action="ignore"),  # of tyro's, that a function makes the pipeline
+        ):
+            return tyro.cli(type(default), default=default, args=words, config=as_nerfstudio_does)
     except SystemExit as error:
         gist = _gist(complaint.getvalue()) if error.code else "they only ask for help"
         raise InputError(

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
+import tyro
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
@@ -20,17 +21,12 @@ from nerfstudio.model_components.shaders import NormalsShader
 from nerfstudio.models.base_model import Model
 from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
 from torch import Tensor, nn
-from torch.nn import Parameter
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.datamanager import FROM_CHECKPOINT
 from hsi_sc_nerf.data.dataparser import CAMERA_ROTATION
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.evaluation.spectral_metrics import (
-    metrics_of_regions,
-    spectral_angle_mapper,
-    spectral_rmse,
-)
+from hsi_sc_nerf.evaluation.spectral_metrics import metrics_of_regions, spectral_angle_mapper, spectral_rmse
 from hsi_sc_nerf.fields.camera_shading import REFRESH_EVERY
 from hsi_sc_nerf.fields.hash_grid import grid_for_dataset
 from hsi_sc_nerf.fields.occupancy_grid import OccupancyGrid
@@ -110,6 +106,14 @@ class SpectralModelConfig(NerfactoModelConfig):
     """Rays rendered at a time."""
     camera_optimizer: PoseRefinementConfig = field(default_factory=PoseRefinementConfig)
     """Refinement of the measured poses."""
+    # Nerfacto's settings that change nothing here: the command line neither shows nor takes them.
+    enable_collider: tyro.conf.Fixed[bool] = False
+    collider_params: tyro.conf.Fixed[dict[str, float] | None] = None
+    loss_coefficients: tyro.conf.Fixed[dict[str, float]] = field(default_factory=dict)
+    prompt: tyro.conf.Fixed[str | None] = None
+    background_color: tyro.conf.Fixed[Literal["random", "last_sample", "black", "white"]] = "last_sample"
+    hidden_dim_transient: tyro.conf.Fixed[int] = 64
+    use_same_proposal_network: tyro.conf.Fixed[bool] = False
 
     def __post_init__(self) -> None:
         try:
@@ -133,10 +137,8 @@ class SpectralModelConfig(NerfactoModelConfig):
 class SpectralModel(NerfactoModel):
     """Nerfacto whose field emits a spectrum (paper, section "Model Formulation").
 
-    It adds the output ``spectral`` (reflectance, a value a band) to nerfacto's; ``rgb`` is three of its bands.
-
-    Attributes:
-        effects: that are simulated (`MODEL_EFFECTS`).
+    It adds the output ``spectral`` (reflectance, a value a band) to nerfacto's; ``rgb`` is three of its bands. Its
+    attribute ``effects`` names those that it simulates (`MODEL_EFFECTS`).
     """
 
     config: SpectralModelConfig
@@ -232,7 +234,7 @@ class SpectralModel(NerfactoModel):
         if self.field.shading is not None and step % REFRESH_EVERY == 0:
             self.field.shading.refresh(self.occupancy.opacity)
 
-    def get_param_groups(self) -> dict[str, list[Parameter]]:
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Nerfacto's groups, with one for the weights of the field's networks, and without those that are empty."""
         return with_network_group(super().get_param_groups(), self.field)
 
@@ -343,7 +345,6 @@ class SpectralModel(NerfactoModel):
         """The paper's metrics of a held-out view, masked to the foreground and (``full_``) over the whole frame."""
         truth, valid = self._measured(batch)
         outputs = {name: image.to(self.device) for name, image in outputs.items()}
-        metrics = metrics_of_regions(
-            outputs["spectral"], truth, {"": batch["mask"][..., 0].bool(), "full_": None}, valid
-        )
+        regions = {"": batch["mask"][..., 0].bool(), "full_": None}
+        metrics = metrics_of_regions(outputs["spectral"], truth, regions, valid)
         return metrics, view_images(outputs, truth, valid, self.rgb_bands)

@@ -93,6 +93,7 @@ def test_words_change_the_method_and_nothing_else():
         ("nerfacto", (), "no method is named 'nerfacto'"),
         ("hsi-sc-nerf", ("--pipeline.model.max-ress", "3"), "nrecognized options: --pipeline.model.max-ress"),
         ("hsi-sc-nerf", ("--pipeline.model.max-res", "x"), "(Error parsing"),
+        ("hsi-sc-nerf", ("--pipeline.model.background-color", "black"), "options: --pipeline.model.background-color"),
         ("hsi-sc-nerf", ("--help",), "only ask for help"),
     ],
 )
