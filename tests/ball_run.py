@@ -88,7 +88,10 @@ def fill_with_ball(run) -> None:
         densities = density(samples.frustums.get_positions())
         return {FieldHeadNames.DENSITY: densities, FieldHeadNames.RGB: spectrum.expand(*densities.shape[:-1], -1)}
 
-    model.field.forward, model.field.density_fn = field, density
+    def density_and_features(samples):
+        return density(samples.frustums.get_positions()), None
+
+    model.field.forward, model.field.density_fn, model.field.get_density = field, density, density_and_features
     model.occupancy.refresh_all(density)
 
 

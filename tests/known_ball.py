@@ -49,6 +49,7 @@ class BallModel:
     field = SimpleNamespace(
         density_fn=lambda p: 2000.0 * (p.norm(dim=-1, keepdim=True) < RADIUS).float(),
         density_gradient=lambda p: -p,
+        rise_length=0.0,
     )
 
     background: object | None = object()

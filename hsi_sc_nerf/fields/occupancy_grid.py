@@ -87,23 +87,39 @@ class OccupancyGrid(nn.Module):
         return self.lower + (corners + torch.rand(corners.shape, device=cells.device)) * self.cell
 
     @torch.no_grad()
-    def refresh(self, density_fn: Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n 1"]], step: int) -> None:
-        """Ask for the field's density at a random point of some of the cells, others at each step."""
+    def refresh(
+        self,
+        density_fn: Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n 1"]],
+        step: int,
+        rise_length: Float[Tensor, ""] | float = 0.0,
+    ) -> None:
+        """Ask for the field's density at a random point of some of the cells, others at each step.
+
+        Args:
+            density_fn: density at points.
+            step: of training.
+            rise_length: as in `opaque_density`; a ray has met the whole density of a cell after its rise.
+        """
         if step % REFRESH_EVERY == 0:
-            self._refresh_part(density_fn, step // REFRESH_EVERY % REFRESH_PARTS)
+            self._refresh_part(density_fn, step // REFRESH_EVERY % REFRESH_PARTS, self.cell + rise_length)
 
     @torch.no_grad()
     def refresh_all(self, density_fn: Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n 1"]]) -> None:
         """Take over the field's density in all cells."""
         for _ in range(FULL_REFRESHES):
             for part in range(REFRESH_PARTS):
-                self._refresh_part(density_fn, part)
+                self._refresh_part(density_fn, part, self.cell)
 
-    def _refresh_part(self, density_fn: Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n 1"]], part: int) -> None:
+    def _refresh_part(
+        self,
+        density_fn: Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n 1"]],
+        part: int,
+        length: Float[Tensor, ""] | float,
+    ) -> None:
         cells = self._candidates[part::REFRESH_PARTS]
         density = density_fn(self._points_in(cells))[:, 0].to(self.opacity)
         flat = self.opacity.view(-1)
-        flat[cells] += LEARNED * (1.0 - torch.exp(-self.cell * density) - flat[cells])
+        flat[cells] += LEARNED * (1.0 - torch.exp(-length * density) - flat[cells])
 
 
 def grid_over(aabb: Float[Tensor, "2 3"]) -> tuple[tuple[int, int, int], float]:

@@ -27,6 +27,7 @@ from torch import Tensor, nn
 
 from hsi_sc_nerf.fields.camera_shading import CameraShading
 from hsi_sc_nerf.fields.hash_grid import FusedHashEncoding, fuse_hash_encodings
+from hsi_sc_nerf.fields.surface_opacity import opaque_density
 
 BRIGHTNESS_GAIN = 0.5
 """Gain of the first coefficient of a spectral basis. Without it, brightness is learned faster than the density, and
@@ -55,7 +56,11 @@ class SpectralField(NerfactoField):
         hidden_dim_color: width of the radiance head.
         num_layers_color: layers of the radiance head.
         skip_unseen: give samples of nil weight no spectrum, unless on a GPU.
+        rises: let rises of the density be opaque; how much, `rise_length` says.
         **nerfacto: other arguments of `NerfactoField`.
+
+    Attributes:
+        rise_length: as in `opaque_density`, scene units; 0 in a new field.
 
     Example:
         >>> box = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
@@ -63,6 +68,8 @@ class SpectralField(NerfactoField):
         >>> field.density_fn(torch.zeros(1024, 48, 3)).shape
         torch.Size([1024, 48, 1])
     """
+
+    rise_length: Tensor
 
     def __init__(
         self,
@@ -74,11 +81,13 @@ class SpectralField(NerfactoField):
         hidden_dim_color: int = 64,
         num_layers_color: int = 3,
         skip_unseen: bool = False,
+        rises: bool = False,
         **nerfacto,
     ) -> None:
         super().__init__(aabb, hidden_dim_color=hidden_dim_color, num_layers_color=num_layers_color, **nerfacto)
         self.view_dependent, self.shading = view_dependent, shading
-        self.skip_unseen = skip_unseen
+        self.skip_unseen, self.rises = skip_unseen, rises
+        self.register_buffer("rise_length", torch.zeros(()))  # kept with the weights, which mean nothing without it
         direction_channels = self.direction_encoding.get_out_dim() if view_dependent else 0
         self.mlp_head = MLP(
             in_dim=direction_channels + self.geo_feat_dim + self.appearance_embedding_dim,
@@ -102,7 +111,10 @@ class SpectralField(NerfactoField):
                 module.inplace = True  # the same numbers, in 3 % less time a step without a GPU
 
     def get_density(self, ray_samples: RaySamples) -> tuple[Float[Tensor, "*bs 1"], Float[Tensor, "*bs geo"]]:
-        """Density and geometry features; positions carry a gradient only where normals are needed."""
+        """Density (along rays with the opacity of its rises) and geometry features.
+
+        Positions carry a gradient only where normals are needed.
+        """
         positions = ray_samples.frustums.get_positions()
         if self.use_pred_normals and torch.is_grad_enabled() and not positions.requires_grad:
             positions.requires_grad_()
@@ -114,6 +126,8 @@ class SpectralField(NerfactoField):
         # The logarithm of the density up to a constant; normals are its gradients.
         self._density_before_activation = hidden[..., :1]
         density = density_of(hidden[..., :1], inside, self.average_init_density)
+        if self.rises and ray_samples.deltas is not None:  # density_fn's samples lie on no ray
+            density = opaque_density(density[..., 0], ray_samples.deltas[..., 0], self.rise_length)[..., None]
         self.last_density = density.detach()
         return density, hidden[..., 1:]
 

@@ -68,6 +68,7 @@ def build_field(
         num_bands=num_bands,
         view_dependent=view_dependent and "shading" not in options,
         skip_unseen=config.num_proposal_iterations == 0,
+        rises=occupancy is not None,
         spatial_distortion=contraction,
         hidden_dim=config.hidden_dim,
         base_res=config.base_res,

@@ -230,7 +230,7 @@ class SpectralModel(NerfactoModel):
         if step == 0 and next(self.field.parameters()).requires_grad:  # not if the first stage freezes the field
             self.field.start_solid(self.occupancy.random_points)
             self.occupancy.refresh_all(self.field.density_fn)
-        self.occupancy.refresh(self.field.density_fn, step)
+        self.occupancy.refresh(self.field.density_fn, step, self.field.rise_length)
         if self.field.shading is not None and step % REFRESH_EVERY == 0:
             self.field.shading.refresh(self.occupancy.opacity)
 
@@ -278,7 +278,7 @@ class SpectralModel(NerfactoModel):
         rays = self.collider(ray_bundle)  # type: ignore[misc]
         self.camera_optimizer.apply_to_raybundle(rays)
         samples = self.proposal_sampler(rays, density_fns=self.density_fns)[0]
-        weights = samples.get_weights(self.field.density_fn(samples.frustums.get_positions()))
+        weights = samples.get_weights(self.field.get_density(samples)[0])
         depth, opacity = self.renderer_depth(weights, samples), self.renderer_accumulation(weights)
         outputs = self._of_all_rays({"depth": depth, "accumulation": opacity}, rays)
         return outputs["depth"], outputs["accumulation"]

@@ -205,15 +205,15 @@ class StagedTrainer(Trainer):
         """One step of its stage."""
         self.schedule.begin_step(step)
         stage, position = self.schedule.stage, self.schedule.position
-        manager = self.pipeline.datamanager
-        manager.foreground_ray_fraction = stage.config.foreground_ray_fraction
-        manager.boundary_ray_fraction = stage.config.boundary_ray_fraction
+        manager, of_stage = self.pipeline.datamanager, stage.config
+        manager.foreground_ray_fraction = of_stage.foreground_ray_fraction
+        manager.boundary_ray_fraction = of_stage.boundary_ray_fraction
         if isinstance(self._model.proposal_sampler, OccupancySampler):
-            self._model.proposal_sampler.samples_in_training = stage.config.samples_per_ray
+            self._model.proposal_sampler.samples_in_training = of_stage.samples_per_ray
+            self._model.field.rise_length.fill_(of_stage.rise_length)
         self._freeze({group for group in self.optimizers.parameters if not stage.learns(group, position)})
         rates = self.optimizers.scale_learning_rates(lambda group: stage.lr_factor(position, group))
-        sampler = self._model.proposals
-        if sampler is not None:
+        if (sampler := self._model.proposals) is not None:
             # Evaluations and the viewer change these counters too, and nerfstudio's checkpoints lack them.
             sampler._step, sampler._steps_since_update = max(0, step - 1), self._steps_since_update
 

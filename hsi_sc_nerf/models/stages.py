@@ -37,6 +37,9 @@ class StageConfig:
     without a foreground ray fraction."""
     samples_per_ray: int | None = between(1, math.inf, default=None)
     """Samples a ray in this stage, if fewer than the model's and an occupancy grid places them. None: the model's."""
+    rise_length: float = between(0.0, math.inf, default=0.0)
+    """How opaque a rise of the density is where an occupancy grid places the samples: as much as this length of the
+    density, scene units. With it, the outlines and the texture agree on one surface (docs/concepts/model.md)."""
     frozen_groups: tuple[str, ...] = ()
     """Parameter groups that this stage does not change. What they learned so far stays in force, unless the pose
     refinement's mode is free-discarded."""
@@ -91,6 +94,7 @@ def masked_stage() -> StageConfig:
         fraction=paper.STAGE_ITERATIONS[1] / sum(paper.STAGE_ITERATIONS),
         foreground_ray_fraction=0.75,
         boundary_ray_fraction=0.8,
+        rise_length=0.02,
         frozen_groups=("camera_opt",),
         lr_start=0.5,
         lr_end=0.02,

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from hsi_sc_nerf.fields.surface_opacity import opaque_density
 from hsi_sc_nerf.surface.surface_depth import opacity_crossing_depth
 
 REACH, FAR_REACH = 0.055, 0.11
@@ -46,6 +47,7 @@ def move_to_silhouettes(
     points: Float[Tensor, "n 3"],
     normals: Float[Tensor, "n 3"],
     touching_opacity: float = 0.5,
+    rise_length: float = 0.0,
 ) -> Float[Tensor, "n 3"]:
     """Points near the surface, moved along their normals to where a touching ray collects ``touching_opacity``.
 
@@ -58,6 +60,7 @@ def move_to_silhouettes(
         points: within a millimetre or two of the surface, scene units.
         normals: outward unit vectors.
         touching_opacity: opacity of a ray that touches the surface, in (0, 1).
+        rise_length: as in `opaque_density`.
 
     Example:
         >>> moved = move_to_silhouettes(model.field.density_fn, vertices, vertex_normals)
@@ -66,6 +69,7 @@ def move_to_silhouettes(
     tangents, step = _tangents(normals), _NORMAL_STEP * normals
     for max_step in MAX_STEPS:
         depth, touches = _least_touching_depth(density_fn, moved, tangents)
+        depth = depth + rise_length * _density(density_fn, moved)  # which is the ray's largest
         touched &= touches
         rise = (_density(density_fn, moved - step) / _density(density_fn, moved + step)).log()
         e_folding = (2.0 * _NORMAL_STEP / rise.clamp_min(1e-6)).clamp(*E_FOLDING_DEPTH)
@@ -76,6 +80,7 @@ def move_to_silhouettes(
     depths = torch.linspace(-SEARCH[0], SEARCH[1], SEARCH_STEPS + 1, device=points.device)
     middles = (depths[1:] + depths[:-1]) / 2.0
     densities = _density(density_fn, points[:, None] - normals[:, None] * middles[:, None])
+    densities = opaque_density(densities, depths.diff(), rise_length)
     collected = torch.nn.functional.pad((densities * depths.diff()).cumsum(dim=1), (1, 0))
     opacity = USUAL_OPACITY
     if touched.any():

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from hsi_sc_nerf.fields.ray_marching import cell_of
+from hsi_sc_nerf.fields.surface_opacity import opaque_density
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.numerics import safe_ratio
 
@@ -48,7 +49,7 @@ def surface_depth(
     """Depth of the surface along rays, searched in fine steps around an initial depth.
 
     The surface is where a ray along the normal would have collected ``SURFACE_OPACITY``. Oblique rays cross more of
-    the density shell, so the density is multiplied by the cosine of their angle.
+    the density shell, so the density, but not its rise, is multiplied by the cosine of their angle.
 
     Args:
         model: trained model, in evaluation mode.
@@ -63,13 +64,15 @@ def surface_depth(
     """
     offsets = torch.linspace(-SEARCH_DEPTH, SEARCH_DEPTH, SEARCH_STEPS + 1, device=initial_depth.device)
     edges = (initial_depth + offsets).clamp_min(0.0)
-    densities = densities_along(model, origins, directions, edges)
-    opacity = 1.0 - torch.exp(-(densities * edges.diff(dim=-1)).sum(dim=-1, keepdim=True))
+    densities, lengths = densities_along(model, origins, directions, edges), edges.diff(dim=-1)
+    opaque = opaque_density(densities, lengths, model.field.rise_length)
+    opacity = 1.0 - torch.exp(-(opaque * lengths).sum(dim=-1, keepdim=True))
     if cosines is None:
-        interior = origins + directions * opacity_crossing_depth(edges, densities, INTERIOR_OPACITY)[:, None]
+        interior = origins + directions * opacity_crossing_depth(edges, opaque, INTERIOR_OPACITY)[:, None]
         inward_normals = functional.normalize(model.field.density_gradient(interior), dim=-1)
         cosines = (inward_normals * directions).sum(dim=-1, keepdim=True).clamp_min(MIN_COSINE)
-    return opacity_crossing_depth(edges, densities * cosines, SURFACE_OPACITY)[:, None], opacity
+    as_from_front = opaque + densities * (cosines - 1.0)  # a rise is the same from everywhere
+    return opacity_crossing_depth(edges, as_from_front, SURFACE_OPACITY)[:, None], opacity
 
 
 def opacity_crossing_depth(

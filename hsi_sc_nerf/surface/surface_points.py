@@ -203,7 +203,7 @@ def surface_mesh(
         return None
     vertices, kept = mesh.vertices.copy(), np.zeros(len(mesh.vertices), bool)
     normals = mesh.normals_at(mesh.vertices)
-    floor = float(box[0][2])
+    floor, rise_length = float(box[0][2]), float(model.field.rise_length)
 
     def density_fn(points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 1"]:
         # Rays that touch the object's base would end in its support.
@@ -213,7 +213,7 @@ def surface_mesh(
         for start in range(0, len(vertices), points_per_batch):
             rows = slice(start, start + points_per_batch)
             before, outward = (torch.from_numpy(a[rows]).float().to(model.device) for a in (mesh.vertices, normals))
-            after = move_to_silhouettes(density_fn, before, outward, touching_opacity)
+            after = move_to_silhouettes(density_fn, before, outward, touching_opacity, rise_length)
             inwards = after[:, None] - outward[:, None] * torch.arange(0.0, OPAQUE_WITHIN, _STEP).to(after)[:, None]
             opacity = 1.0 - torch.exp(-density_fn(inwards)[..., 0].sum(dim=1) * _STEP)
             vertices[rows] = after.cpu().numpy()

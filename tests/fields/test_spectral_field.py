@@ -5,6 +5,7 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.field_components.spatial_distortions import SceneContraction
 
 from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalField
+from hsi_sc_nerf.fields.surface_opacity import opaque_density
 
 BOX = torch.tensor([[-1.0, -0.5, -1.0], [1.0, 0.5, 0.2]])
 SIZE = {
@@ -61,6 +62,23 @@ def test_half_precision_of_tiny_cuda_nn_is_taken():
     made.direction_encoding.forward = lambda directions: encode(directions).half()
     spectra = made.get_outputs(samples, features.half())[FieldHeadNames.RGB]
     torch.testing.assert_close(spectra, expected, rtol=0, atol=5e-3)
+
+
+def test_rises_are_opaque_along_rays_alone():
+    samples = rays()
+    plain, made = field(), field(rises=True)
+    torch.testing.assert_close(made.get_density(samples)[0], plain.get_density(samples)[0])
+    made.rise_length.fill_(0.1)
+    density = plain.get_density(samples)[0][..., 0]
+    expected = opaque_density(density, samples.deltas[..., 0], 0.1)
+    assert (expected > 1.1 * density).any()
+    torch.testing.assert_close(made.get_density(samples)[0][..., 0], expected)
+    torch.testing.assert_close(made.last_density[..., 0], expected)
+    points = samples.frustums.get_positions()
+    torch.testing.assert_close(made.density_fn(points), plain.density_fn(points))
+    again = field(rises=True)
+    again.load_state_dict(made.state_dict())
+    assert again.rise_length == made.rise_length
 
 
 def test_no_ray_has_no_density():

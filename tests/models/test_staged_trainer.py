@@ -54,14 +54,15 @@ def test_two_stages_run_in_one_go(tiny_dataset, tmp_path, device):
 
 @pytest.mark.slow
 def test_what_a_stage_says_holds_in_it_alone(tiny_dataset, tmp_path, monkeypatch):
-    """Frozen groups, learning rates, the grid's decay, samples a ray and the paper's rays, by stage."""
+    """Frozen groups, learning rates, the grid's decay, samples a ray, opaque rises and the paper's rays, by stage."""
     first, second = full_frame_stage(), masked_stage()
     first.frozen_groups, first.group_lr = ("fields", "field_networks"), {"fields": (0.1, 0.1)}
     second.frozen_groups, second.foreground_ray_fraction = ("camera_opt",), 1.0
     first.grid_decay, second.grid_decay = 0.2, 3.0
     first.samples_per_ray = 5
+    first.rise_length, second.rise_length = 0.01, 0.03
     made = trainer(tiny_dataset, tmp_path, full_frame=first, masked=second)
-    rates, changed, shrunk, samples = [], [], [], []
+    rates, changed, shrunk, samples, rises = [], [], [], [], []
     sampler = made.pipeline.model.proposal_sampler
     sampler.register_forward_hook(lambda _, given, found: samples.append(found[0].frustums.shape[1]))
     monkeypatch.setattr(made.pipeline.model.field, "shrink_grid", shrunk.append)
@@ -74,6 +75,7 @@ def test_what_a_stage_says_holds_in_it_alone(tiny_dataset, tmp_path, monkeypatch
             if any(not torch.equal(a, b) for a, b in zip(before[name], group, strict=True)):
                 changed.append((step, name))
         rates.append(made.optimizers.optimizers["fields"].param_groups[0]["lr"])
+        rises.append(float(made.pipeline.model.field.rise_length))
         return result
 
     made.train_iteration = train_iteration
@@ -83,6 +85,7 @@ def test_what_a_stage_says_holds_in_it_alone(tiny_dataset, tmp_path, monkeypatch
     assert {name for step, name in changed if step >= 3} == {"fields", "field_networks"}
     assert shrunk == pytest.approx([3.0 * rate for rate in rates[3:]])  # the first stage does not learn the field
     assert samples[:6] == [5] * 3 + [8] * 3
+    assert rises == pytest.approx([0.01] * 3 + [0.03] * 3)
 
 
 @pytest.mark.slow

@@ -46,6 +46,17 @@ def test_touching_rays_collect_the_opacity_that_is_given(opacity):
     torch.testing.assert_close(moved.norm(dim=-1), torch.full((len(points),), 0.1), atol=1e-3, rtol=0)
 
 
+@pytest.mark.parametrize("rise_length", [0.005, 0.05])
+def test_opaque_rises_are_counted(rise_length):
+    """Half of the rays' opacity is the density's, half its rise's, or nearly all of it."""
+    radius = 0.1
+    along = math.sqrt(2.0 * math.pi * radius * FOLDING)
+    density_fn = soft(lambda p: p.norm(dim=-1) - radius, math.log(2.0) / (along + rise_length))
+    points, normals = around(radius)
+    moved = move_to_silhouettes(density_fn, points, normals, rise_length=rise_length)
+    torch.testing.assert_close(moved.norm(dim=-1), torch.full((len(points),), radius), atol=1e-3, rtol=0)
+
+
 def test_the_opacity_from_the_front_would_depend_on_the_radius():
     """Why there is no such threshold: it would be three times as large on the small ball as on the large one."""
     assert touching_density(0.03) / touching_density(0.25) == pytest.approx(2.9, abs=0.1)

@@ -28,15 +28,17 @@ def test_an_empty_ray_ends_at_its_last_edge():
     assert opacity_crossing_depth(edges, torch.zeros(3, 10), 0.25).tolist() == [1.0] * 3
 
 
+@pytest.mark.parametrize("rise_length", [0.0, 0.03])
 @pytest.mark.parametrize("normal_is_known", [True, False])
 @pytest.mark.parametrize("angle_deg", [0.0, 45.0, 60.0, 75.0])
-def test_an_oblique_ray_finds_the_surface_where_a_frontal_one_does(angle_deg, normal_is_known):
+def test_an_oblique_ray_finds_the_surface_where_a_frontal_one_does(angle_deg, normal_is_known, rise_length):
     rise = 4000.0  # of the density with the depth below z = 0: a quarter of a unit is opaque
     soft_ground = SimpleNamespace(
         occupancy=None,
         field=SimpleNamespace(
             density_fn=lambda p: -rise * p[..., 2:].clamp_max(0.0),
             density_gradient=lambda p: torch.tensor([0.0, 0.0, -rise]) * (p[..., 2:] < 0.0),
+            rise_length=rise_length,
         ),
     )
     angle = math.radians(angle_deg)
@@ -46,8 +48,9 @@ def test_an_oblique_ray_finds_the_surface_where_a_frontal_one_does(angle_deg, no
         soft_ground, origins, directions, torch.full((1, 1), 2.02), cosines if normal_is_known else None
     )
     below = -(origins + depth * directions)[0, 2].item()
-    # The optical depth of a frontal ray is rise * z^2 / 2; steps of the search are 5e-3 units of a ray.
-    expected = math.sqrt(-2.0 * math.log1p(-SURFACE_OPACITY) / rise)
+    # The optical depth of a frontal ray is rise * (z^2 / 2 + rise_length * z); the search steps by 5e-3 of a ray.
+    optical_depth = -math.log1p(-SURFACE_OPACITY)
+    expected = math.sqrt(rise_length**2 + 2.0 * optical_depth / rise) - rise_length
     assert below == pytest.approx(expected, abs=1e-3)
     assert opacity.item() > 0.99
 

@@ -118,7 +118,8 @@ def test_the_base_is_found_down_to_what_the_object_stands_on() -> None:
         outside = points.norm(dim=-1, keepdim=True) - RADIUS
         return 10.0 * torch.exp(-outside / 0.003).clamp(max=40.0) + 40.0 * (points[..., 2:] < floor)
 
-    model = SimpleNamespace(field=SimpleNamespace(density_fn=density_fn), occupancy=None, device="cpu")
+    field = SimpleNamespace(density_fn=density_fn, rise_length=0.0)
+    model = SimpleNamespace(field=field, occupancy=None, device="cpu")
     box = np.array([[-0.4, -0.4, floor], [0.4, 0.4, 0.4]])
     mesh = surface_mesh(model, ball_from_all_sides(), box, 4096)
     vertices = mesh.vertices[np.unique(mesh.triangles)]
