@@ -24,6 +24,7 @@ import trimesh
 import tyro
 from independent_session import BANDS, NODES_NM, IndependentSession, mixing_matrix
 from jaxtyping import Float
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from open3d.core import Tensor
 from paper_tables import mean_and_deviation
@@ -92,7 +93,7 @@ class PathTracedAccuracy:
     results: Path = RESULTS
     """Folder of the CSV file."""
     picture: Path | None = None
-    """Where to draw the brightness of the first seed's cloud relative to the skin's."""
+    """Where to draw the first seed's cloud: its brightness relative to the skin's, its height above the surface."""
 
     def main(self) -> None:
         """Do what is missing, print the table, write it."""
@@ -204,10 +205,15 @@ class PathTracedAccuracy:
         scene = ray_scene(vertices, faces)
         points_m = sample_surface(vertices, faces, POINTS)
         seen = np.any([visible_from(scene, points_m, pose[:3, 3]) for pose in run.dataset.camera_to_worlds], axis=0)
-        heights_m = scene.compute_signed_distance(Tensor(cloud.points.astype(np.float32))).numpy().astype(float)
+        heights_m = self._heights_m(cloud.points)
         distances_m = np.abs(heights_m), Surface(cloud.points).distances_m(points_m[seen])
         scores = {name: score_at(*distances_m, limit_m).f_score for name, limit_m in THRESHOLDS_M.items()}
         return scores | {"height above the surface, mm": 1e3 * float(np.median(heights_m))}
+
+    def _heights_m(self, points_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """Signed distances from the true surface, outside of it positive."""
+        scene = ray_scene(np.asarray(self._mesh.vertices), np.asarray(self._mesh.faces))
+        return scene.compute_signed_distance(Tensor(points_m.astype(np.float32))).numpy().astype(float)
 
     def _sizes(self, out: Path) -> dict[str, float]:
         traits = json.loads((out / "traits" / "traits.json").read_text(encoding="utf-8"))
@@ -244,7 +250,7 @@ class PathTracedAccuracy:
         }
 
     def _draw(self, out: Path, path: Path) -> None:
-        """The brightness of the points that face the first frame, relative to the skin's."""
+        """The points that face the first frame: their brightness relative to the skin's, their height."""
         cloud, material = self._clouds(out)
         camera = camera_pose(0.0)
         sight = camera[:3, 3] - cloud.points
@@ -252,14 +258,18 @@ class PathTracedAccuracy:
         rows = facing[np.argsort(-np.linalg.norm(sight[facing], axis=1))]
         true = self._true_material(cloud.select(rows)).mean(axis=1)
         place_cm = 100.0 * (cloud.points[rows] - cloud.points.mean(axis=0)) @ camera[:3, :2]
-        figure = Figure(figsize=(9.0, 4.0), layout="constrained")
-        titles = "as measured", "of the material"
-        for axes, title, spectra in zip(figure.subplots(1, 2), titles, (cloud.spectra, material), strict=True):
-            ratio = spectra[rows].mean(axis=1) / true
-            shown = axes.scatter(*place_cm.T, c=ratio, s=0.6, cmap="RdBu_r", vmin=0.5, vmax=1.5, rasterized=True)
-            axes.set_title(f"brightness {title}, relative to the skin's")
+        panels = (
+            ("brightness as measured, relative to the skin's", cloud.spectra[rows].mean(axis=1) / true, (0.5, 1.5)),
+            ("brightness of the material, relative to the skin's", material[rows].mean(axis=1) / true, (0.5, 1.5)),
+            ("height above the true surface, mm", 1e3 * self._heights_m(cloud.points[rows]), (-1.0, 1.0)),
+        )
+        figure = Figure(figsize=(13.0, 3.8), layout="constrained")
+        for axes, (title, values, limits) in zip(figure.subplots(1, len(panels)), panels, strict=True):
+            norm = Normalize(*limits)
+            shown = axes.scatter(*place_cm.T, c=values, s=0.6, cmap="RdBu_r", norm=norm, rasterized=True)
+            axes.set_title(title, fontsize=10)
             axes.set(aspect="equal", xlabel="cm")
-        figure.colorbar(shown, ax=figure.axes)
+            figure.colorbar(shown, ax=axes)
         figure.savefig(path, dpi=110)
 
 
