@@ -18,6 +18,7 @@ from torch.nn import functional
 from hsi_sc_nerf.fields.camera_shading import LARGEST_LOG_GAIN, CameraShading
 from hsi_sc_nerf.fields.hash_grid import interpolate_hash_grid
 from hsi_sc_nerf.fields.spectral_field import CoefficientGain, density_of
+from hsi_sc_nerf.fields.surface_opacity import opaque_density
 from hsi_sc_nerf.geometry.camera import cross_matrix, look_at
 from hsi_sc_nerf.models.backgrounds import interpolate_image
 from hsi_sc_nerf.models.compositing import BasisDecoder, SpectralRenderer
@@ -136,6 +137,7 @@ CASES = {
         lambda weights: free_space_loss(weights, torch.tensor([[0.2, 0.1, 0.1, -0.1, -0.1]]), torch.arange(3) / 2.0),
         [random(3, 5, seed=1)],
     ),
+    "opaque rises": lambda: (lambda density: opaque_density(density, random(3, 5), 0.3), [random(3, 5, seed=1)]),
     "weights": lambda: (light_through, [random(3, 5, 1, seed=1)]),
     "spectrum": lambda: spectrum(False),
     "spectrum, last sample behind": lambda: spectrum(True),

@@ -35,6 +35,19 @@ def test_what_falls_takes_no_light_and_what_rises_again_does():
     torch.testing.assert_close(opaque_density(hill, lengths, 2.0), expected)
 
 
+def test_it_is_that_of_loops():
+    generator = torch.Generator().manual_seed(0)
+    densities, lengths = torch.rand(2, 7, 6, generator=generator, dtype=torch.float64)
+    found = opaque_density(densities, lengths, 0.4)
+    for ray in range(7):
+        before = 0.0
+        for sample in range(6):
+            density, length = float(densities[ray, sample]), float(lengths[ray, sample])
+            depth = density * length + 0.4 * max(density - before, 0.0)
+            assert float(found[ray, sample]) * length == pytest.approx(depth, rel=1e-12)
+            before = density
+
+
 def test_a_ray_that_begins_in_matter_meets_its_whole_density():
     inside = torch.full((1, 3), 5.0)
     torch.testing.assert_close(opaque_density(inside, torch.ones(1, 3), 0.1), torch.tensor([[5.5, 5.0, 5.0]]))
