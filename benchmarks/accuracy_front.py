@@ -120,7 +120,7 @@ def draw_front(path: Path, rows: Sequence[Sequence[str]]) -> None:
     for name, second, error in zip(
         [row[1] for row in by_seconds if row[0] == "presets"],
         ranges("training, s", "presets")[:, 0],
-        ranges("without the noise: SAM", "presets")[:, 0],
+        np.maximum(*(ranges(name, "presets")[:, 0] for name in ("without the noise: SAM", " RMSE"))),
         strict=True,
     ):
         by_time.annotate(name, (second, error), (0, 9), textcoords="offset points", ha="center", fontsize=8)
