@@ -77,6 +77,7 @@ SETTINGS: dict[str, str] = {
     "16 samples a ray": f"{_MODEL}.num-nerf-samples-per-ray 16 --full-frame.samples-per-ray 16",
     "32 samples a ray": "--full-frame.samples-per-ray 32",
     "64 samples a ray": f"{_MODEL}.num-nerf-samples-per-ray 64",
+    "no opaque rises": "--masked.rise-length 0",
     "every band a channel": f"{_MODEL}.head direct",
     **{f"basis of {size}": f"{_MODEL}.basis-size {size}" for size in (4, 8, 16, 32)},
     "the paper's hash grid": f"{_MODEL}.match-resolution False",
