@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
@@ -45,6 +45,9 @@ from hsi_sc_nerf.models.presets import Preset
 from hsi_sc_nerf.models.trained_run import TrainedRun, open_trained_run
 from hsi_sc_nerf.simulate.scores import visible_from
 from hsi_sc_nerf.spectra import nearest_bands
+
+if TYPE_CHECKING:
+    from open3d.t.geometry import RaycastingScene
 
 COLUMNS: dict[str, dict[str, int]] = {
     "poses: largest error, deg, mm": {"rotation, deg": 3, "position, mm": 2},
@@ -199,12 +202,15 @@ class PathTracedAccuracy:
         assert isinstance(mesh, trimesh.Trimesh)
         return mesh
 
+    @cached_property
+    def _rays(self) -> RaycastingScene:
+        return ray_scene(np.asarray(self._mesh.vertices), np.asarray(self._mesh.faces))
+
     def _surface(self, run: TrainedRun, cloud: SpectralCloud) -> dict[str, float]:
         """F-scores of what a camera sees, and the median signed distance from the true surface."""
-        vertices, faces = np.asarray(self._mesh.vertices), np.asarray(self._mesh.faces)
-        scene = ray_scene(vertices, faces)
-        points_m = sample_surface(vertices, faces, POINTS)
-        seen = np.any([visible_from(scene, points_m, pose[:3, 3]) for pose in run.dataset.camera_to_worlds], axis=0)
+        points_m = sample_surface(np.asarray(self._mesh.vertices), np.asarray(self._mesh.faces), POINTS)
+        eyes_m = run.dataset.camera_to_worlds[:, :3, 3]
+        seen = np.any([visible_from(self._rays, points_m, eye_m) for eye_m in eyes_m], axis=0)
         heights_m = self._heights_m(cloud.points)
         distances_m = np.abs(heights_m), Surface(cloud.points).distances_m(points_m[seen])
         scores = {name: score_at(*distances_m, limit_m).f_score for name, limit_m in THRESHOLDS_M.items()}
@@ -212,8 +218,7 @@ class PathTracedAccuracy:
 
     def _heights_m(self, points_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """Signed distances from the true surface, outside of it positive."""
-        scene = ray_scene(np.asarray(self._mesh.vertices), np.asarray(self._mesh.faces))
-        return scene.compute_signed_distance(Tensor(points_m.astype(np.float32))).numpy().astype(float)
+        return self._rays.compute_signed_distance(Tensor(points_m.astype(np.float32))).numpy().astype(float)
 
     def _sizes(self, out: Path) -> dict[str, float]:
         traits = json.loads((out / "traits" / "traits.json").read_text(encoding="utf-8"))
@@ -226,8 +231,7 @@ class PathTracedAccuracy:
 
     def _true_material(self, cloud: SpectralCloud) -> Float[np.ndarray, "n bands"]:
         """Reflectance of the skin below its gloss, relative to the tarp's, where the true surface is nearest."""
-        scene = ray_scene(np.asarray(self._mesh.vertices), np.asarray(self._mesh.faces))
-        nearest = scene.compute_closest_points(Tensor(cloud.points.astype(np.float32)))
+        nearest = self._rays.compute_closest_points(Tensor(cloud.points.astype(np.float32)))
         corner = self._mesh.faces[nearest["primitive_ids"].numpy().astype(int)][:, 0]
         skin = material_reflectance(self._mesh, self._scene.spots, cloud.wavelengths_nm)
         return (skin / tarp_reflectance(cloud.wavelengths_nm))[corner]

@@ -139,8 +139,9 @@ def training_config(method: str, words: Sequence[str]) -> TrainerConfig:
         with (
             contextlib.redirect_stderr(complaint),
             contextlib.redirect_stdout(complaint),
-            warnings.catch_warnings(action="ignore"),  # of tyro's, that a function makes the pipeline
+            warnings.catch_warnings(),
         ):
+            warnings.simplefilter("ignore")  # tyro's, that a function makes the pipeline
             return tyro.cli(type(default), default=default, args=words, config=as_nerfstudio_does)
     except SystemExit as error:
         gist = _gist(complaint.getvalue()) if error.code else "they only ask for help"
