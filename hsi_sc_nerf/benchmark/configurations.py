@@ -10,6 +10,7 @@ import shlex
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import dropwhile, takewhile
 from typing import TYPE_CHECKING
 
 from hsi_sc_nerf.errors import InputError
@@ -151,6 +152,11 @@ def training_config(method: str, words: Sequence[str]) -> TrainerConfig:
 
 
 def _gist(complaint: str) -> str:
-    """The first line below the title of tyro's message, whatever the frame is drawn with."""
-    lines = [line.strip("│ ") for line in complaint.splitlines() if line.strip("╭╮╰╯│─- ")]
-    return lines[1].rstrip(".") if len(lines) > 1 else "no reason is given"
+    """The sentence below the title of tyro's message, whatever its width and whatever the frame is drawn with."""
+    lines = [line.strip("│ ") for line in complaint.splitlines() if line.strip("│ ")]
+    below_title = dropwhile(_is_rule, lines[1:])
+    return " ".join(takewhile(lambda line: not _is_rule(line), below_title)).rstrip(".") or "no reason is given"
+
+
+def _is_rule(line: str) -> bool:
+    return not line.strip("╭╮╰╯├┤─-")

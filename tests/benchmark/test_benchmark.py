@@ -94,6 +94,11 @@ def test_words_change_the_method_and_nothing_else():
         ("hsi-sc-nerf", ("--pipeline.model.max-ress", "3"), "nrecognized options: --pipeline.model.max-ress"),
         ("hsi-sc-nerf", ("--pipeline.model.max-res", "x"), "(Error parsing"),
         ("hsi-sc-nerf", ("--pipeline.model.background-color", "black"), "options: --pipeline.model.background-color"),
+        (  # tyro tells this in two lines
+            "hsi-sc-nerf",
+            ("--pipeline.model.number-of-samples", "32", "--pipeline.model.learning-rate-of-grid", "0.1"),
+            "--pipeline.model.number-of-samples, 32, --pipeline.model.learning-rate-of-grid, 0.1)",
+        ),
         ("hsi-sc-nerf", ("--help",), "only ask for help"),
     ],
 )
