@@ -17,6 +17,11 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.settings_file import between
 
+FIRST_RISE = 1 / 3
+"""Part of a stage's rise length that holds from its start: hollows are opened by soft densities."""
+GROWN_AFTER = 0.6
+"""Part of a stage in which the surface becomes harder. In the rest, whose learning rates are small, it settles."""
+
 
 @dataclass
 class StageConfig:
@@ -39,7 +44,11 @@ class StageConfig:
     """Samples a ray in this stage, if fewer than the model's and an occupancy grid places them. None: the model's."""
     rise_length: float = between(0.0, math.inf, default=0.0)
     """How opaque a rise of the density is where an occupancy grid places the samples: as much as this length of the
-    density, scene units. With it, the outlines and the texture agree on one surface (docs/concepts/model.md)."""
+    density, scene units; a third of it at the stage's start. With it, the outlines and the texture agree on one
+    surface (docs/concepts/model.md)."""
+    sharpness: float = between(1.0, 10.0, default=1.0)
+    """How many times as steep the density becomes at the surface where an occupancy grid places the samples; 1 at
+    the stage's start."""
     frozen_groups: tuple[str, ...] = ()
     """Parameter groups that this stage does not change. What they learned so far stays in force, unless the pose
     refinement's mode is free-discarded."""
@@ -94,7 +103,8 @@ def masked_stage() -> StageConfig:
         fraction=paper.STAGE_ITERATIONS[1] / sum(paper.STAGE_ITERATIONS),
         foreground_ray_fraction=0.75,
         boundary_ray_fraction=0.8,
-        rise_length=0.02,
+        rise_length=0.06,
+        sharpness=2.0,
         frozen_groups=("camera_opt",),
         lr_start=0.5,
         lr_end=0.02,
@@ -131,6 +141,13 @@ class Stage:
         first, last = self.config.group_lr.get(group, (self.config.lr_start, self.config.lr_end))
         length = self.end - self.start if self.timed else max(1, self.end - self.start - 1)
         return first * (last / first) ** min(1.0, max(0.0, (position - self.start) / length))
+
+    def opacity(self, position: float) -> tuple[float, float]:
+        """Rise length and sharpness at ``position``, which grow evenly until `GROWN_AFTER` of the stage."""
+        grown = (position - self.start) / (GROWN_AFTER * (self.end - self.start))
+        grown = min(1.0, max(0.0, grown))
+        rise_length = self.config.rise_length * (FIRST_RISE + (1.0 - FIRST_RISE) * grown)
+        return rise_length, 1.0 + (self.config.sharpness - 1.0) * grown
 
 
 @dataclass(frozen=True)
