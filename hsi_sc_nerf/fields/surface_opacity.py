@@ -1,12 +1,12 @@
 """Opacity of a soft surface: a ray loses light where the density rises along it, besides in the density itself.
-The surface becomes sharper while training goes on.
 
 A trained density rises over a millimetre or two. A ray that touches the surface stays in that rise for centimetres,
 and a ray from the front crosses it at once. So by density alone, the outlines see a surface one or two millimetres
 outside the one that the texture on its front shows, and no density suits both. A rise takes the same light from a ray
 whatever its direction, as the opacity of NeuS does (Wang et al. 2021, "NeuS: Learning Neural Implicit Surfaces by
 Volume Rendering", section 3.1), which follows from the change of a signed distance. The more of the opacity is due to
-the rise, the closer lie both surfaces. Or the rise is made steeper, as NeuS does by its inverse deviation.
+the rise, the closer lie both surfaces. They also come closer as the density becomes steeper, which NeuS learns and
+which follows a schedule here.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn import functional
 
 SURFACE_DENSITY = 50.0
-"""A sharper surface stays in place where it has this density (per scene unit), with its rise about half opaque."""
+"""A sharper surface stays in place where it has this density (per scene unit), about where the light ends."""
 SHORTEST = 1e-9
 """Samples of no length, which have no opacity, are taken to have this length; scene units."""
 
