@@ -56,7 +56,7 @@ class SpectralField(NerfactoField):
         hidden_dim_color: width of the radiance head.
         num_layers_color: layers of the radiance head.
         skip_unseen: give samples of nil weight no spectrum, unless on a GPU.
-        rises: let rises of the density be opaque; how much, `rise_length` says.
+        rises: let rises of the density be opaque and the density steeper; how much, `set_opacity` says.
         **nerfacto: other arguments of `NerfactoField`.
 
     Attributes:
@@ -89,7 +89,8 @@ class SpectralField(NerfactoField):
         super().__init__(aabb, hidden_dim_color=hidden_dim_color, num_layers_color=num_layers_color, **nerfacto)
         self.view_dependent, self.shading = view_dependent, shading
         self.skip_unseen, self.rises = skip_unseen, rises
-        self.register_buffer("rise_length", torch.zeros(()))  # kept with the weights, which mean nothing without it
+        # Kept with the weights, which mean nothing without them.
+        self.register_buffer("rise_length", torch.zeros(()))
         self.register_buffer("sharpness", torch.ones(()))
         direction_channels = self.direction_encoding.get_out_dim() if view_dependent else 0
         self.mlp_head = MLP(
@@ -133,7 +134,9 @@ class SpectralField(NerfactoField):
         hidden = hidden.view(*ray_samples.frustums.shape, hidden.shape[-1])
         # The logarithm of the density up to a constant; normals are its gradients.
         self._density_before_activation = hidden[..., :1]
-        raw = sharpened(hidden[..., :1].to(inside), self.sharpness, self.average_init_density)
+        raw = hidden[..., :1].to(inside)
+        if self.rises:
+            raw = sharpened(raw, self.sharpness, self.average_init_density)
         density = density_of(raw, inside, self.average_init_density)
         if self.rises and ray_samples.deltas is not None:  # density_fn's samples lie on no ray
             density = opaque_density(density[..., 0], ray_samples.deltas[..., 0], self.rise_length)[..., None]
