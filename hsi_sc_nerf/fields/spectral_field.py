@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from hsi_sc_nerf.fields.camera_shading import CameraShading
 from hsi_sc_nerf.fields.hash_grid import FusedHashEncoding, fuse_hash_encodings
-from hsi_sc_nerf.fields.surface_opacity import opaque_density, sharpened
+from hsi_sc_nerf.fields.surface_opacity import opaque_density
 
 BRIGHTNESS_GAIN = 0.5
 """Gain of the first coefficient of a spectral basis. Without it, brightness is learned faster than the density, and
@@ -56,12 +56,11 @@ class SpectralField(NerfactoField):
         hidden_dim_color: width of the radiance head.
         num_layers_color: layers of the radiance head.
         skip_unseen: give samples of nil weight no spectrum, unless on a GPU.
-        rises: let rises of the density be opaque and the density steeper; how much, `set_opacity` says.
+        rises: let rises of the density be opaque; how much, `rise_length` says.
         **nerfacto: other arguments of `NerfactoField`.
 
     Attributes:
         rise_length: as in `opaque_density`, scene units; 0 in a new field.
-        sharpness: as in `sharpened`; 1 in a new field.
 
     Example:
         >>> box = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
@@ -71,7 +70,6 @@ class SpectralField(NerfactoField):
     """
 
     rise_length: Tensor
-    sharpness: Tensor
 
     def __init__(
         self,
@@ -89,9 +87,7 @@ class SpectralField(NerfactoField):
         super().__init__(aabb, hidden_dim_color=hidden_dim_color, num_layers_color=num_layers_color, **nerfacto)
         self.view_dependent, self.shading = view_dependent, shading
         self.skip_unseen, self.rises = skip_unseen, rises
-        # Kept with the weights, which mean nothing without them.
-        self.register_buffer("rise_length", torch.zeros(()))
-        self.register_buffer("sharpness", torch.ones(()))
+        self.register_buffer("rise_length", torch.zeros(()))  # kept with the weights, which mean nothing without it
         direction_channels = self.direction_encoding.get_out_dim() if view_dependent else 0
         self.mlp_head = MLP(
             in_dim=direction_channels + self.geo_feat_dim + self.appearance_embedding_dim,
@@ -114,11 +110,6 @@ class SpectralField(NerfactoField):
             if isinstance(module, nn.ReLU):
                 module.inplace = True  # the same numbers, in 3 % less time a step without a GPU
 
-    def set_opacity(self, rise_length: float, sharpness: float) -> None:
-        """Set both attributes, in place: a graph of a step on a GPU reads them there."""
-        self.rise_length.fill_(rise_length)
-        self.sharpness.fill_(sharpness)
-
     def get_density(self, ray_samples: RaySamples) -> tuple[Float[Tensor, "*bs 1"], Float[Tensor, "*bs geo"]]:
         """Density (along rays with the opacity of its rises) and geometry features.
 
@@ -134,10 +125,7 @@ class SpectralField(NerfactoField):
         hidden = hidden.view(*ray_samples.frustums.shape, hidden.shape[-1])
         # The logarithm of the density up to a constant; normals are its gradients.
         self._density_before_activation = hidden[..., :1]
-        raw = hidden[..., :1].to(inside)
-        if self.rises:
-            raw = sharpened(raw, self.sharpness, self.average_init_density)
-        density = density_of(raw, inside, self.average_init_density)
+        density = density_of(hidden[..., :1], inside, self.average_init_density)
         if self.rises and ray_samples.deltas is not None:  # density_fn's samples lie on no ray
             density = opaque_density(density[..., 0], ray_samples.deltas[..., 0], self.rise_length)[..., None]
         self.last_density = density.detach()

@@ -5,40 +5,17 @@ and a ray from the front crosses it at once. So by density alone, the outlines s
 outside the one that the texture on its front shows, and no density suits both. A rise takes the same light from a ray
 whatever its direction, as the opacity of NeuS does (Wang et al. 2021, "NeuS: Learning Neural Implicit Surfaces by
 Volume Rendering", section 3.1), which follows from the change of a signed distance. The more of the opacity is due to
-the rise, the closer lie both surfaces. They also come closer as the density becomes steeper, which NeuS learns and
-which follows a schedule here.
+the rise, the closer lie both surfaces.
 """
 
 from __future__ import annotations
-
-import math
 
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-SURFACE_DENSITY = 50.0
-"""A sharper surface stays in place where it has this density (per scene unit), about where the light ends."""
 SHORTEST = 1e-9
 """Samples of no length, which have no opacity, are taken to have this length; scene units."""
-
-
-def sharpened(
-    raw: Float[Tensor, "*samples"], sharpness: Float[Tensor, ""] | float, average: float
-) -> Float[Tensor, "*samples"]:
-    """The logarithm of a density over ``average`` that rises ``sharpness`` times as steeply at the surface.
-
-    Args:
-        raw: natural logarithm of a density over ``average``. Where it is `SURFACE_DENSITY`, it stays.
-        sharpness: positive; 1 changes nothing.
-        average: per scene unit.
-
-    Example:
-        >>> sharpened(torch.tensor([-1.0, 0.0, 1.0]), sharpness=2.0, average=SURFACE_DENSITY)
-        tensor([-2.,  0.,  2.])
-    """
-    at_surface = math.log(SURFACE_DENSITY / average)
-    return at_surface + sharpness * (raw - at_surface)
 
 
 def opaque_density(

@@ -210,7 +210,7 @@ class StagedTrainer(Trainer):
         manager.boundary_ray_fraction = of_stage.boundary_ray_fraction
         if isinstance(self._model.proposal_sampler, OccupancySampler):
             self._model.proposal_sampler.samples_in_training = of_stage.samples_per_ray
-            self._model.field.set_opacity(*stage.opacity(position))
+            self._model.field.rise_length.fill_(stage.rise_length(position))
         self._freeze({group for group in self.optimizers.parameters if not stage.learns(group, position)})
         rates = self.optimizers.scale_learning_rates(lambda group: stage.lr_factor(position, group))
         if (sampler := self._model.proposals) is not None:

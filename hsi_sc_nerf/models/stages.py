@@ -46,9 +46,6 @@ class StageConfig:
     """How opaque a rise of the density is where an occupancy grid places the samples: as much as this length of the
     density, scene units; a third of it at the stage's start. With it, the outlines and the texture agree on one
     surface (docs/concepts/model.md)."""
-    sharpness: float = between(1.0, 10.0, default=1.0)
-    """How many times as steep the density becomes at the surface where an occupancy grid places the samples; 1 at
-    the stage's start."""
     frozen_groups: tuple[str, ...] = ()
     """Parameter groups that this stage does not change. What they learned so far stays in force, unless the pose
     refinement's mode is free-discarded."""
@@ -104,7 +101,6 @@ def masked_stage() -> StageConfig:
         foreground_ray_fraction=0.75,
         boundary_ray_fraction=0.8,
         rise_length=0.06,
-        sharpness=2.0,
         frozen_groups=("camera_opt",),
         lr_start=0.5,
         lr_end=0.02,
@@ -142,12 +138,10 @@ class Stage:
         length = self.end - self.start if self.timed else max(1, self.end - self.start - 1)
         return first * (last / first) ** min(1.0, max(0.0, (position - self.start) / length))
 
-    def opacity(self, position: float) -> tuple[float, float]:
-        """Rise length and sharpness at ``position``, which grow evenly until `GROWN_AFTER` of the stage."""
+    def rise_length(self, position: float) -> float:
+        """Rise length at ``position``, scene units, which grows evenly until `GROWN_AFTER` of the stage."""
         grown = (position - self.start) / (GROWN_AFTER * (self.end - self.start))
-        grown = min(1.0, max(0.0, grown))
-        rise_length = self.config.rise_length * (FIRST_RISE + (1.0 - FIRST_RISE) * grown)
-        return rise_length, 1.0 + (self.config.sharpness - 1.0) * grown
+        return self.config.rise_length * (FIRST_RISE + (1.0 - FIRST_RISE) * min(1.0, max(0.0, grown)))
 
 
 @dataclass(frozen=True)

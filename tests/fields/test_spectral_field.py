@@ -5,7 +5,7 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.field_components.spatial_distortions import SceneContraction
 
 from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalField
-from hsi_sc_nerf.fields.surface_opacity import SURFACE_DENSITY, opaque_density
+from hsi_sc_nerf.fields.surface_opacity import opaque_density
 
 BOX = torch.tensor([[-1.0, -0.5, -1.0], [1.0, 0.5, 0.2]])
 SIZE = {
@@ -79,21 +79,6 @@ def test_rises_are_opaque_along_rays_alone():
     again = field(rises=True)
     again.load_state_dict(made.state_dict())
     assert again.rise_length == made.rise_length
-
-
-def test_a_sharper_surface_is_everywhere_the_density_is_asked_for():
-    samples, made = rays(), field(rises=True)
-    made.set_opacity(0.1, 1.0)
-    points = samples.frustums.get_positions()
-    soft = made.density_fn(points)
-    made.set_opacity(0.1, 2.0)
-    torch.testing.assert_close(made.density_fn(points), SURFACE_DENSITY * (soft / SURFACE_DENSITY) ** 2)
-    density = made.density_fn(points)[..., 0]
-    expected = opaque_density(density, samples.deltas[..., 0], 0.1)
-    torch.testing.assert_close(made.get_density(samples)[0][..., 0], expected)
-    again = field(rises=True)
-    again.load_state_dict(made.state_dict())
-    assert (again.rise_length, again.sharpness) == (made.rise_length, made.sharpness)
 
 
 def test_no_ray_has_no_density():

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from hsi_sc_nerf.fields.surface_opacity import SURFACE_DENSITY, opaque_density, sharpened
+from hsi_sc_nerf.fields.surface_opacity import opaque_density
 
 FOLDING = 0.003
 STEP = 1e-4
@@ -18,14 +18,6 @@ def along(rate_of_descent, nearest):
 def optical_depth(densities, rise_length):
     lengths = torch.full_like(densities, STEP)
     return float((opaque_density(densities, lengths, rise_length) * lengths).sum())
-
-
-@pytest.mark.parametrize("sharpness", [1.0, 2.0, 3.5])
-def test_a_sharper_surface_is_a_power_of_the_density_and_stays_in_place(sharpness):
-    density = torch.tensor([0.3, 2.0, SURFACE_DENSITY, 900.0], dtype=torch.float64)
-    found = 0.1 * sharpened((density / 0.1).log(), sharpness, 0.1).exp()
-    torch.testing.assert_close(found, SURFACE_DENSITY * (density / SURFACE_DENSITY) ** sharpness)
-    assert float(found[2]) == pytest.approx(SURFACE_DENSITY)
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 60.0, 85.0])

@@ -61,9 +61,8 @@ def test_what_a_stage_says_holds_in_it_alone(tiny_dataset, tmp_path, monkeypatch
     first.grid_decay, second.grid_decay = 0.2, 3.0
     first.samples_per_ray = 5
     second.rise_length = 0.03
-    second.sharpness = 3.0
     made = trainer(tiny_dataset, tmp_path, full_frame=first, masked=second)
-    rates, changed, shrunk, samples, rises, sharp = [], [], [], [], [], []
+    rates, changed, shrunk, samples, rises = [], [], [], [], []
     sampler = made.pipeline.model.proposal_sampler
     sampler.register_forward_hook(lambda _, given, found: samples.append(found[0].frustums.shape[1]))
     monkeypatch.setattr(made.pipeline.model.field, "shrink_grid", shrunk.append)
@@ -77,7 +76,6 @@ def test_what_a_stage_says_holds_in_it_alone(tiny_dataset, tmp_path, monkeypatch
                 changed.append((step, name))
         rates.append(made.optimizers.optimizers["fields"].param_groups[0]["lr"])
         rises.append(float(made.pipeline.model.field.rise_length))
-        sharp.append(float(made.pipeline.model.field.sharpness))
         return result
 
     made.train_iteration = train_iteration
@@ -88,7 +86,6 @@ def test_what_a_stage_says_holds_in_it_alone(tiny_dataset, tmp_path, monkeypatch
     assert shrunk == pytest.approx([3.0 * rate for rate in rates[3:]])  # the first stage does not learn the field
     assert samples[:6] == [5] * 3 + [8] * 3
     assert rises == pytest.approx([0.0] * 3 + [0.01, 0.01 + 0.02 / 1.8, 0.03])
-    assert sharp == pytest.approx([1.0] * 4 + [1.0 + 2.0 / 1.8, 3.0])
 
 
 @pytest.mark.slow

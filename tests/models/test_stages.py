@@ -58,11 +58,10 @@ def test_every_step_belongs_to_the_stage_that_covers_it():
 
 @pytest.mark.parametrize("timed", [False, True])
 def test_a_surface_becomes_harder_in_three_fifths_of_its_stage(timed):
-    stage = Stage(StageConfig("masked", 0.5, rise_length=0.03, sharpness=3.0), 100, 200, timed)
-    rises, sharp = zip(*map(stage.opacity, (100, 130, 160, 200)), strict=True)
+    stage = Stage(StageConfig("masked", 0.5, rise_length=0.03), 100, 200, timed)
+    rises = [stage.rise_length(position) for position in (100, 130, 160, 200)]
     assert rises == pytest.approx([0.01, 0.02, 0.03, 0.03])
-    assert sharp == pytest.approx([1.0, 2.0, 3.0, 3.0])
-    assert Stage(full_frame_stage(), 0, 100).opacity(50) == (0.0, 1.0)
+    assert Stage(full_frame_stage(), 0, 100).rise_length(50) == 0.0
 
 
 def test_learning_rates_fall_exponentially_within_the_stage_and_a_group_may_have_its_own():
