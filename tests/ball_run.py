@@ -74,14 +74,16 @@ def write_untrained_run(data: Path, output_dir: Path) -> Path:
     return path
 
 
-def fill_with_ball(run) -> None:
-    """Put the ball in the place of the model's densities and spectra."""
+def fill_with_ball(run, solid=None) -> None:
+    """Put the ball, or what is ``solid`` at points in metres, in the place of the model's densities and spectra."""
     model = run.model
     centre = torch.from_numpy(run.to_scene(factory.SPHERE_CENTRE_M)).float().to(model.device)
     radius = factory.SPHERE_RADIUS_M * run.scale
     spectrum = torch.from_numpy(factory.PLANT).float().to(model.device)
 
     def density(positions, times=None):
+        if solid is not None:
+            return DENSITY * solid(torch.from_numpy(run.to_metres(positions.numpy(force=True))).float())[..., None]
         return DENSITY * ((positions - centre).norm(dim=-1, keepdim=True) < radius)
 
     def field(samples, compute_normals=False):

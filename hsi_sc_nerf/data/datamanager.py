@@ -153,6 +153,10 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
             return self._train_rays(indices, quartered), self._held(indices)
         return self._train_rays(indices, quartered), _tensors(sampler.at(pixels))
 
+    def training_pixels(self, pixels: Int[np.ndarray, "count 3"]) -> tuple[RayBundle, dict]:
+        """The rays and contents of some pixels (frame, line, sample) of the training frames."""
+        return self._train_rays(torch.from_numpy(pixels)), _tensors(self.train_pixel_sampler.at(pixels))
+
     def next_eval(self, step: int) -> tuple[RayBundle, dict]:
         """Random pixels of held-out views."""
         self.eval_count += 1

@@ -86,6 +86,10 @@ class OccupancyGrid(nn.Module):
         corners = torch.stack([cells // (y * z), cells // z % y, cells % z], dim=-1)
         return self.lower + (corners + torch.rand(corners.shape, device=cells.device)) * self.cell
 
+    def clear(self, cells: Bool[Tensor, "x y z"]) -> None:
+        """Leave no matter in these cells, for good."""
+        self.opacity[cells] = -1.0
+
     @torch.no_grad()
     def refresh(
         self,
@@ -119,7 +123,8 @@ class OccupancyGrid(nn.Module):
         cells = self._candidates[part::REFRESH_PARTS]
         density = density_fn(self._points_in(cells))[:, 0].to(self.opacity)
         flat = self.opacity.view(-1)
-        flat[cells] += LEARNED * (1.0 - torch.exp(-length * density) - flat[cells])
+        known = flat[cells]  # -1 where `clear` left no matter
+        flat[cells] = torch.where(known < 0.0, known, known + LEARNED * (1.0 - torch.exp(-length * density) - known))
 
 
 def grid_over(aabb: Float[Tensor, "2 3"]) -> tuple[tuple[int, int, int], float]:

@@ -18,6 +18,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from hsi_sc_nerf.data.datamanager import SpectralDataManager
+from hsi_sc_nerf.models.floating_matter import CLEAR_EVERY, clear_floating_matter
 from hsi_sc_nerf.models.occupancy_sampler import pixels_with_matter
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 
@@ -50,6 +51,13 @@ class SpectralPipeline(VanillaPipeline):
             metadata = self.datamanager.train_dataparser_outputs.metadata
             pixels = pixels_with_matter(grid, metadata["dataset"], metadata["frames"])
             self.datamanager.train_pixel_sampler.restrict_background(pixels)
+
+    def prepare_step(self, step: int) -> None:
+        """Bring the model up to date before a step of training, and clear what floats in the air now and then."""
+        model = cast(SpectralModel, self.model)
+        model.prepare_step(step)
+        if model.occupancy is not None and step > 0 and step % CLEAR_EVERY == 0:
+            clear_floating_matter(model, self.datamanager, step)
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load the weights of a checkpoint that was made with the same model settings and dataset.

@@ -1,0 +1,122 @@
+"""Matter that hangs in the air, apart from all else, and without which the measured pixels are met better.
+
+Masks do not show a hollow, so training begins with the cap that the visual hull has over it. Most of the cap goes
+while spectra are learned. What is left of it hangs over the hollow, and is opaque, so that nothing thins it: no ray
+shows what was learned behind it. Such pieces are therefore left out on trial.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+
+from hsi_sc_nerf.data.datamanager import SpectralDataManager
+from hsi_sc_nerf.fields.occupancy_grid import GRID_CELLS, HULL_MARGIN_M
+from hsi_sc_nerf.geometry.camera import pixels_of
+from hsi_sc_nerf.models.spectral_model import SpectralModel
+from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
+
+_NEIGHBOURS = np.ones((3, 3, 3), bool)
+CLEAR_EVERY = 100
+"""Steps of training between two searches."""
+MIN_OPACITY = 0.1
+"""Cells of this opacity hold a piece together, also by an edge or a corner: thin parts are hardly opaque."""
+LARGEST_PART = 0.01
+"""A piece that hangs in the air has fewer cells than this part of the largest piece."""
+MOST_PIECES = 4
+"""Pieces that are tried in a search, the largest first."""
+PIXELS = 256
+"""Pixels that judge a piece."""
+LARGEST_REST = 0.97
+"""A piece is cleared if at most this part of their squared error is left: without it, samples lie elsewhere on rays,
+which alone changes the error a little."""
+
+
+@torch.no_grad()
+def clear_floating_matter(model: SpectralModel, manager: SpectralDataManager, step: int) -> int:
+    """Clear floating pieces of a model's occupancy grid for good where the training pixels are met better without.
+
+    Args:
+        model: with an occupancy grid.
+        manager: of the training frames.
+        step: of training; the pixels are drawn by it.
+
+    Returns:
+        Number of pieces that were cleared.
+    """
+    grid, cleared = model.occupancy, 0
+    assert grid is not None
+    dataset: PackedDataset = manager.train_dataparser_outputs.metadata["dataset"]
+    above_base_m = dataset.object_box_m[0, 2] + HULL_MARGIN_M - dataset.scene_box_m[0, 2]
+    lowest = int(np.ceil(above_base_m / _cell_m(dataset)))
+    for cells in floating_pieces(grid.opacity.numpy(force=True), lowest):
+        pixels = _pixels_that_look_at(cells, manager, step)
+        if len(pixels):
+            before, with_piece = grid.opacity.clone(), _squared_error(model, manager, pixels)
+            grid.clear(torch.from_numpy(cells).to(before.device))
+            if _squared_error(model, manager, pixels) < LARGEST_REST * with_piece:
+                cleared += 1
+            else:
+                grid.opacity.copy_(before)
+    return cleared
+
+
+def floating_pieces(opacity: Float[np.ndarray, "x y z"], lowest: int) -> list[Bool[np.ndarray, "x y z"]]:
+    """The largest connected pieces of a grid that hang in the air, each with the cells around it.
+
+    Args:
+        opacity: of the cells; below 0 where there is no matter.
+        lowest: pieces with a cell below this one along z may stand on the support.
+
+    Example:
+        >>> [piece.sum() for piece in floating_pieces(grid.opacity.numpy(), lowest=45)]
+        [140]
+    """
+    pieces, _ = ndimage.label(opacity > MIN_OPACITY, structure=_NEIGHBOURS)
+    sizes = np.bincount(pieces.ravel())
+    sizes[0] = 0  # what is too thin
+    bounds = ndimage.find_objects(pieces)
+    small = [piece for piece in np.argsort(-sizes) if 0 < sizes[piece] < LARGEST_PART * sizes.max()]
+    found = []
+    for piece in [piece for piece in small if bounds[piece - 1][2].start >= lowest][:MOST_PIECES]:
+        around = ndimage.binary_dilation(pieces == piece, structure=_NEIGHBOURS)
+        found.append(around & ((pieces == 0) | (pieces == piece)) & (opacity >= 0.0))
+    return found
+
+
+def _pixels_that_look_at(
+    cells: Bool[np.ndarray, "x y z"], manager: SpectralDataManager, step: int
+) -> Int[np.ndarray, "at_most_pixels 3"]:
+    """Random training pixels (frame, line, sample) that look at cells; lens distortion is neglected."""
+    metadata = manager.train_dataparser_outputs.metadata
+    dataset: PackedDataset = metadata["dataset"]
+    frames: list[PackedFrame] = metadata["frames"]
+    rng = np.random.default_rng(step)
+    indices = rng.permutation(np.argwhere(cells))
+    indices = np.resize(indices, (PIXELS, 3))  # again from the first where there are fewer
+    points_m = dataset.scene_box_m[0] + (indices + rng.random(indices.shape)) * _cell_m(dataset)
+    of_point = rng.integers(len(frames), size=PIXELS)
+    pixels = []
+    for index in np.unique(of_point):
+        inside, xy_px = pixels_of(points_m[of_point == index], frames[index].camera_to_world, dataset.intrinsics)
+        pixels.append(np.insert(xy_px[inside, ::-1], 0, index, axis=1))
+    return np.concatenate(pixels)
+
+
+def _squared_error(model: SpectralModel, manager: SpectralDataManager, pixels: Int[np.ndarray, "count 3"]) -> float:
+    """Mean squared error of the rendered reflectance of training pixels."""
+    rays, batch = manager.training_pixels(pixels)
+    training = model.training
+    spectral = model.eval()(rays.to(model.device))["spectral"]
+    model.train(training)
+    squares = (spectral - batch["spectral"].to(spectral)).square()
+    valid = batch.get("valid")
+    if valid is not None:
+        squares = squares[valid.to(squares.device)]
+    return float(squares.mean())
+
+
+def _cell_m(dataset: PackedDataset) -> float:
+    return float(np.ptp(dataset.scene_box_m, axis=0).max()) / GRID_CELLS
