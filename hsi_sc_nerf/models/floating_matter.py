@@ -1,8 +1,9 @@
-"""Matter that hangs in the air, apart from all else, and without which the measured pixels are met better.
+"""Matter that hangs in the air, apart from all else, and without which the measured pixels are met as well.
 
 Masks do not show a hollow, so training begins with the cap that the visual hull has over it. Most of the cap goes
 while spectra are learned. What is left of it hangs over the hollow, and is opaque, so that nothing thins it: no ray
-shows what was learned behind it. Such pieces are therefore left out on trial.
+shows what was learned behind it. Nothing hangs in the air, so such pieces are left out unless the pixels object: a
+thin part, such as the end of a stem, may touch the rest by what is not opaque enough to be seen.
 """
 
 from __future__ import annotations
@@ -27,16 +28,15 @@ LARGEST_PART = 0.01
 """A piece that hangs in the air has fewer cells than this part of the largest piece."""
 MOST_PIECES = 4
 """Pieces that are tried in a search, the largest first."""
-PIXELS = 256
+PIXELS = 512
 """Pixels that judge a piece."""
-LARGEST_REST = 0.97
-"""A piece is cleared if at most this part of their squared error is left: without it, samples lie elsewhere on rays,
-which alone changes the error a little."""
+CLEARLY = 2.0
+"""Pixels are clearly met worse if the mean rise of their squared errors is more than so many of its standard errors."""
 
 
 @torch.no_grad()
 def clear_floating_matter(model: SpectralModel, manager: SpectralDataManager, step: int) -> int:
-    """Clear floating pieces of a model's occupancy grid for good where the training pixels are met better without.
+    """Clear floating pieces of a model's occupancy grid for good, but for those that the training pixels ask for.
 
     Args:
         model: with an occupancy grid.
@@ -51,38 +51,42 @@ def clear_floating_matter(model: SpectralModel, manager: SpectralDataManager, st
     dataset: PackedDataset = manager.train_dataparser_outputs.metadata["dataset"]
     above_base_m = dataset.object_box_m[0, 2] + HULL_MARGIN_M - dataset.scene_box_m[0, 2]
     lowest = int(np.ceil(above_base_m / _cell_m(dataset)))
-    for cells in floating_pieces(grid.opacity.numpy(force=True), lowest):
-        pixels = _pixels_that_look_at(cells, manager, step)
+    for piece, cells in floating_pieces(grid.opacity.numpy(force=True), lowest):
+        pixels = _pixels_that_look_at(piece, manager, step)
         if len(pixels):
-            before, with_piece = grid.opacity.clone(), _squared_error(model, manager, pixels)
+            before, errors = grid.opacity.clone(), _squared_errors(model, manager, pixels)
             grid.clear(torch.from_numpy(cells).to(before.device))
-            if _squared_error(model, manager, pixels) < LARGEST_REST * with_piece:
-                cleared += 1
-            else:
+            rises = _squared_errors(model, manager, pixels) - errors
+            if rises.mean() > CLEARLY * rises.std(correction=0) / len(rises) ** 0.5:
                 grid.opacity.copy_(before)
+            else:
+                cleared += 1
     return cleared
 
 
-def floating_pieces(opacity: Float[np.ndarray, "x y z"], lowest: int) -> list[Bool[np.ndarray, "x y z"]]:
-    """The largest connected pieces of a grid that hang in the air, each with the cells around it.
+def floating_pieces(
+    opacity: Float[np.ndarray, "x y z"], lowest: int
+) -> list[tuple[Bool[np.ndarray, "x y z"], Bool[np.ndarray, "x y z"]]]:
+    """The largest connected pieces of a grid that hang in the air, each without and with the cells around it.
 
     Args:
         opacity: of the cells; below 0 where there is no matter.
         lowest: pieces with a cell below this one along z may stand on the support.
 
     Example:
-        >>> [piece.sum() for piece in floating_pieces(grid.opacity.numpy(), lowest=45)]
-        [140]
+        >>> [(piece.sum(), cells.sum()) for piece, cells in floating_pieces(grid.opacity.numpy(), lowest=45)]
+        [(28, 180)]
     """
     pieces, _ = ndimage.label(opacity > MIN_OPACITY, structure=_NEIGHBOURS)
     sizes = np.bincount(pieces.ravel())
     sizes[0] = 0  # what is too thin
     bounds = ndimage.find_objects(pieces)
-    small = [piece for piece in np.argsort(-sizes) if 0 < sizes[piece] < LARGEST_PART * sizes.max()]
+    small = [number for number in np.argsort(-sizes) if 0 < sizes[number] < LARGEST_PART * sizes.max()]
     found = []
-    for piece in [piece for piece in small if bounds[piece - 1][2].start >= lowest][:MOST_PIECES]:
-        around = ndimage.binary_dilation(pieces == piece, structure=_NEIGHBOURS)
-        found.append(around & ((pieces == 0) | (pieces == piece)) & (opacity >= 0.0))
+    for number in [number for number in small if bounds[number - 1][2].start >= lowest][:MOST_PIECES]:
+        piece = pieces == number
+        around = ndimage.binary_dilation(piece, structure=_NEIGHBOURS)
+        found.append((piece, around & (piece | (pieces == 0)) & (opacity >= 0.0)))
     return found
 
 
@@ -105,17 +109,19 @@ def _pixels_that_look_at(
     return np.concatenate(pixels)
 
 
-def _squared_error(model: SpectralModel, manager: SpectralDataManager, pixels: Int[np.ndarray, "count 3"]) -> float:
-    """Mean squared error of the rendered reflectance of training pixels."""
+def _squared_errors(
+    model: SpectralModel, manager: SpectralDataManager, pixels: Int[np.ndarray, "count 3"]
+) -> Float[torch.Tensor, "count"]:
+    """Squared error of the rendered reflectance of each training pixel, mean over its measured bands."""
     rays, batch = manager.training_pixels(pixels)
     training = model.training
     spectral = model.eval()(rays.to(model.device))["spectral"]
     model.train(training)
     squares = (spectral - batch["spectral"].to(spectral)).square()
-    valid = batch.get("valid")
-    if valid is not None:
-        squares = squares[valid.to(squares.device)]
-    return float(squares.mean())
+    if "valid" not in batch:
+        return squares.mean(dim=1)
+    valid = batch["valid"].to(squares.device)
+    return (squares * valid).sum(dim=1) / valid.sum(dim=1).clamp_min(1)
 
 
 def _cell_m(dataset: PackedDataset) -> float:
