@@ -31,7 +31,7 @@ MOST_PIECES = 4
 PIXELS = 512
 """Pixels that judge a piece."""
 CLEARLY = 2.0
-"""Pixels are clearly met worse if the mean rise of their squared errors is more than so many of its standard errors."""
+"""Pixels are clearly met worse if the mean rise of their squared errors exceeds so many of its standard errors."""
 
 
 @torch.no_grad()

@@ -52,11 +52,14 @@ class SpectralPipeline(VanillaPipeline):
             pixels = pixels_with_matter(grid, metadata["dataset"], metadata["frames"])
             self.datamanager.train_pixel_sampler.restrict_background(pixels)
 
-    def prepare_step(self, step: int) -> None:
-        """Bring the model up to date before a step of training, and clear what floats in the air now and then."""
+    def prepare_step(self, step: int, last_stage: bool) -> None:
+        """Bring the model up to date before a step of training.
+
+        In the last stage, when the surface has formed, what floats in the air is cleared now and then.
+        """
         model = cast(SpectralModel, self.model)
         model.prepare_step(step)
-        if model.occupancy is not None and step > 0 and step % CLEAR_EVERY == 0:
+        if last_stage and step > 0 and step % CLEAR_EVERY == 0 and model.occupancy is not None:
             clear_floating_matter(model, self.datamanager, step)
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
