@@ -24,8 +24,9 @@ CLEAR_EVERY = 100
 """Steps of training between two searches."""
 MIN_OPACITY = 0.1
 """Cells of this opacity hold a piece together, also by an edge or a corner: thin parts are hardly opaque."""
-LARGEST_PART = 0.01
-"""A piece that hangs in the air has fewer cells than this part of the largest piece."""
+FEWEST_CELLS, LARGEST_PART = 8, 0.01
+"""A piece that hangs in the air has so many cells at least, and fewer than this part of the largest piece. What is
+smaller is a speck of the soft surface."""
 MOST_PIECES = 4
 """Pieces that are tried in a search, the largest first."""
 PIXELS = 512
@@ -81,7 +82,7 @@ def floating_pieces(
     sizes = np.bincount(pieces.ravel())
     sizes[0] = 0  # what is too thin
     bounds = ndimage.find_objects(pieces)
-    small = [number for number in np.argsort(-sizes) if 0 < sizes[number] < LARGEST_PART * sizes.max()]
+    small = [number for number in np.argsort(-sizes) if FEWEST_CELLS <= sizes[number] < LARGEST_PART * sizes.max()]
     found = []
     for number in [number for number in small if bounds[number - 1][2].start >= lowest][:MOST_PIECES]:
         piece = pieces == number
