@@ -147,15 +147,14 @@ class SpectralDataManager(VanillaDataManager[SpectralDataset]):
         fractions = (self.foreground_ray_fraction, self.boundary_ray_fraction, density)
         pixels, on_outline = sampler.draw(step, *fractions)
         quartered = on_outline if self.supersample_outline else 0
-        indices = torch.from_numpy(pixels)
         if self._held is not None:
-            indices = indices.pin_memory().to(self.device, non_blocking=True)
+            indices = torch.from_numpy(pixels).pin_memory().to(self.device, non_blocking=True)
             return self._train_rays(indices, quartered), self._held(indices)
-        return self._train_rays(indices, quartered), _tensors(sampler.at(pixels))
+        return self.training_pixels(pixels, quartered)
 
-    def training_pixels(self, pixels: Int[np.ndarray, "count 3"]) -> tuple[RayBundle, dict]:
-        """The rays and contents of some pixels (frame, line, sample) of the training frames."""
-        return self._train_rays(torch.from_numpy(pixels)), _tensors(self.train_pixel_sampler.at(pixels))
+    def training_pixels(self, pixels: Int[np.ndarray, "count 3"], quartered: int = 0) -> tuple[RayBundle, dict]:
+        """The rays and contents of pixels (frame, line, sample) of training frames, as read from disk."""
+        return self._train_rays(torch.from_numpy(pixels), quartered), _tensors(self.train_pixel_sampler.at(pixels))
 
     def next_eval(self, step: int) -> tuple[RayBundle, dict]:
         """Random pixels of held-out views."""

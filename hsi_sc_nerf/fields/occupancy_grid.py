@@ -127,7 +127,7 @@ class OccupancyGrid(nn.Module):
         flat[cells] = torch.where(known < 0.0, known, known + LEARNED * (1.0 - torch.exp(-length * density) - known))
 
 
-def grid_over(aabb: Float[Tensor, "2 3"]) -> tuple[tuple[int, int, int], float]:
+def grid_over(aabb: Float[Tensor, "2 3"] | Float[np.ndarray, "2 3"]) -> tuple[tuple[int, int, int], float]:
     """Shape of the grid over a box, and the side of its cells in the box's unit."""
     sides = (aabb[1] - aabb[0]).tolist()
     cell = max(sides) / GRID_CELLS

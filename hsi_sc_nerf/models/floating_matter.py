@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from hsi_sc_nerf.data.datamanager import SpectralDataManager
-from hsi_sc_nerf.fields.occupancy_grid import GRID_CELLS, HULL_MARGIN_M
+from hsi_sc_nerf.fields.occupancy_grid import HULL_MARGIN_M, grid_over
 from hsi_sc_nerf.geometry.camera import pixels_of
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
@@ -51,7 +51,7 @@ def clear_floating_matter(model: SpectralModel, manager: SpectralDataManager, st
     assert grid is not None
     dataset: PackedDataset = manager.train_dataparser_outputs.metadata["dataset"]
     above_base_m = dataset.object_box_m[0, 2] + HULL_MARGIN_M - dataset.scene_box_m[0, 2]
-    lowest = int(np.ceil(above_base_m / _cell_m(dataset)))
+    lowest = int(np.ceil(above_base_m / grid_over(dataset.scene_box_m)[1]))
     for piece, cells in floating_pieces(grid.opacity.numpy(force=True), lowest):
         pixels = _pixels_that_look_at(piece, manager, step)
         if len(pixels):
@@ -101,7 +101,8 @@ def _pixels_that_look_at(
     rng = np.random.default_rng(step)
     indices = rng.permutation(np.argwhere(cells))
     indices = np.resize(indices, (PIXELS, 3))  # again from the first where there are fewer
-    points_m = dataset.scene_box_m[0] + (indices + rng.random(indices.shape)) * _cell_m(dataset)
+    _, cell_m = grid_over(dataset.scene_box_m)
+    points_m = dataset.scene_box_m[0] + (indices + rng.random(indices.shape)) * cell_m
     of_point = rng.integers(len(frames), size=PIXELS)
     pixels = []
     for index in np.unique(of_point):
@@ -116,14 +117,10 @@ def _squared_errors(
     """Squared error of the rendered reflectance of each training pixel, mean over its measured bands."""
     rays, batch = manager.training_pixels(pixels)
     training = model.training
-    spectral = model.eval()(rays.to(model.device))["spectral"]
+    spectral = model.eval()(rays)["spectral"]
     model.train(training)
     squares = (spectral - batch["spectral"].to(spectral)).square()
     if "valid" not in batch:
         return squares.mean(dim=1)
     valid = batch["valid"].to(squares.device)
     return (squares * valid).sum(dim=1) / valid.sum(dim=1).clamp_min(1)
-
-
-def _cell_m(dataset: PackedDataset) -> float:
-    return float(np.ptp(dataset.scene_box_m, axis=0).max()) / GRID_CELLS

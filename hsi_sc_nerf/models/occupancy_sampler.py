@@ -14,7 +14,6 @@ from torch import Tensor
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.fields.occupancy_grid import (
-    GRID_CELLS,
     OccupancyGrid,
     bounds_from_masks,
     grid_over,
@@ -106,7 +105,7 @@ def build_occupancy(
     shape, _ = grid_over(aabb)
     if from_checkpoint:
         return OccupancyGrid(aabb, torch.ones(shape, dtype=torch.bool), torch.zeros(shape, dtype=torch.bool))
-    matter, solid = bounds_from_masks(dataset, frames, shape, low_m, sides_m.max() / GRID_CELLS)
+    matter, solid = bounds_from_masks(dataset, frames, shape, low_m, grid_over(dataset.scene_box_m)[1])
     return OccupancyGrid(aabb, torch.from_numpy(matter), torch.from_numpy(solid))
 
 
@@ -114,7 +113,7 @@ def pixels_with_matter(
     grid: OccupancyGrid, dataset: PackedDataset, frames: Sequence[PackedFrame]
 ) -> Bool[np.ndarray, "frames h w"]:
     """The pixels of the frames that look at cells that may hold matter: background rays elsewhere meet nothing."""
-    low_m, high_m = dataset.scene_box_m
     matter = (grid.opacity >= 0.0).numpy(force=True)
     poses = np.stack([frame.camera_to_world for frame in frames])
-    return pixels_of_cells(matter, low_m, float((high_m - low_m).max()) / GRID_CELLS, poses, dataset.intrinsics)
+    _, cell_m = grid_over(dataset.scene_box_m)
+    return pixels_of_cells(matter, dataset.scene_box_m[0], cell_m, poses, dataset.intrinsics)

@@ -6,7 +6,7 @@ import torch
 from ball_run import fill_with_ball, write_ball_dataset, write_untrained_run
 from capture_factory import SPHERE_CENTRE_M, SPHERE_RADIUS_M
 
-from hsi_sc_nerf.fields.occupancy_grid import GRID_CELLS
+from hsi_sc_nerf.fields.occupancy_grid import grid_over
 from hsi_sc_nerf.models.floating_matter import clear_floating_matter, floating_pieces
 from hsi_sc_nerf.models.trained_run import open_trained_run
 
@@ -65,9 +65,9 @@ def test_a_piece_that_hides_the_chamber_is_cleared_for_good(run):
 
     fill_with_ball(run, with_blob)
     grid, training = run.model.occupancy, run.model.training
-    cell_m = np.ptp(run.dataset.scene_box_m, axis=0).max() / GRID_CELLS
+    _, cell_m = grid_over(run.dataset.scene_box_m)
     low_m = torch.from_numpy(run.dataset.scene_box_m[0]).float()
-    centres_m = low_m + (torch.from_numpy(np.indices(grid.opacity.shape)).permute(1, 2, 3, 0) + 0.5) * float(cell_m)
+    centres_m = low_m + (torch.from_numpy(np.indices(grid.opacity.shape)).permute(1, 2, 3, 0) + 0.5) * cell_m
     of_blob, of_ball = (centres_m - BESIDE_M).norm(dim=-1) < 0.005, ball(centres_m)
     assert grid.opacity[of_blob].mean() > 0.5
     assert clear_floating_matter(run.model, run.manager, step=100) == 1
