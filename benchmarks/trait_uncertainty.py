@@ -26,6 +26,7 @@ from hsi_sc_nerf.analysis.traits import analyse
 from hsi_sc_nerf.benchmark.steps import run_step, typed_command
 from hsi_sc_nerf.export.cloud import MAX_INCIDENCE_DEG, read_spectral_ply
 from hsi_sc_nerf.files import read_json, write_json
+from hsi_sc_nerf.models.presets import ITERATIONS, PRESETS
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.simulate.truth import load_truth
 
@@ -50,8 +51,8 @@ class TraitUncertainty:
     """Frames of a session."""
     size: int = 128
     """Width and height of the images, pixels."""
-    iterations: int = 700
-    """Training steps, of 1024 rays."""
+    iterations: int = PRESETS["cpu"]["balanced"][ITERATIONS]
+    """Training steps, of 1024 rays; those of `--preset balanced`, the default."""
     results: Path = RESULTS
     """Folder of the CSV file."""
 
@@ -103,7 +104,7 @@ def measured(folder: Path) -> Iterator[tuple[str, float, float]]:
     true, cloud = TrueObject.of(truth), read_spectral_ply(folder / "export" / "point_cloud.ply")
     config = replace(MeshConfig(), base_height_m=float(true.mesh.vertices[:, 2].min()))
     mesh = closed_mesh(cloud.points, cloud.normals, config)
-    systematic = systematic_errors(dataset, base_known=True)
+    systematic = systematic_errors(mesh, dataset, base_known=True)
     std = combined(size_uncertainty(cloud.points, cloud.normals, mesh, config, splits=3, systematic=systematic))
     size, exact = size_of(mesh), size_of(true.mesh)
     for name, trait in TRAITS.items():

@@ -136,7 +136,9 @@ def measure_traits(
     uncertainty: dict[str, Size] = {}
     if splits:
         systematic = (
-            None if dataset is None else systematic_errors(dataset, base_known=config.base_height_m is not None)
+            None
+            if dataset is None
+            else systematic_errors(closed, dataset, base_known=config.base_height_m is not None)
         )
         with progress_bar("uncertainty", "meshes", sizes_to_find(splits, systematic)) as done:
             uncertainty = size_uncertainty(cloud.points, cloud.normals, closed, config, splits, systematic, done=done)

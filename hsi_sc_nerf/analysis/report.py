@@ -35,6 +35,7 @@ _CAUSES = {
     "detail": "detail finer than the smoothing",
     "scale": "the scale",
     "surface": "the place of the surface",
+    "hollows": "the depth of hollows",
 }
 """Words for the causes of `size_uncertainty`."""
 CM2_PER_M2, MM_PER_M = 1e4, 1e3

@@ -15,18 +15,19 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed, closed_mesh, surface_and_base
+from hsi_sc_nerf.analysis.surface_errors import hollow_std_m, surface_std_m
 from hsi_sc_nerf.files import content_of, read_json
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.packed.dataset import PackedDataset
 
 VARIED_DEPTH = 6
 """Octree depth of the meshes that are compared, which is enough for differences and saves two thirds of the time."""
-SURFACE_PX = 0.07
-"""Standard deviation of where training puts the surface, in pixels on the object (docs/validation/surface.md)."""
 UNKNOWN_BASE_PX = 1.0
-"""The same of the base, where its height is that of the cloud's edge: masks end within a pixel of the base."""
-FOOT = 0.5
-"""Standard deviation of how far the surface continues under itself, as a fraction of what its slope says."""
+"""Standard deviation of the base's height in pixels on the object, where it is that of the cloud's edge: masks end
+within a pixel of the base."""
+HOLLOW_BASE = 0.1
+"""Standard deviation of how deep the unseen base is hollow, as a fraction of its radius: many fruits have a basin. A
+cone of a tenth holds as much as the basin of an apple, 8 mm deep and 25 mm wide."""
 COARSER = 2.0
 """Factor on the smoothing radius. What this changes, finer detail than the smoothing is expected to change again."""
 LITRES_PER_M3 = 1000.0
@@ -90,17 +91,19 @@ def feret_diameters(outline: Float[np.ndarray, "n 2"]) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class SystematicErrors:
-    """Standard deviations of what the points of a cloud have in common.
+    """Standard deviations of what the points of a cloud have in common, for the closed mesh of the cloud.
 
     Attributes:
         scale: of lengths, as a fraction.
-        surface_m: of the place of the whole surface along its normal.
         base_m: of the height of the plane that the object stands on; 0 where it is given.
+        surface_m: of the place of each vertex of the mesh along its normal (`surface_std_m`).
+        hollow_m: of the depth of each vertex in a hollow (`hollow_std_m`).
     """
 
     scale: float
-    surface_m: float
     base_m: float
+    surface_m: Float[np.ndarray, "v"]
+    hollow_m: Float[np.ndarray, "v"]
 
 
 def size_uncertainty(
@@ -115,8 +118,8 @@ def size_uncertainty(
     """Standard deviation of each size by its cause; the causes are independent.
 
     points: random halves of the cloud are meshed (half-samples, McCarthy 1969). base: the unseen base is closed
-    straight down instead of along the surface's slope, and at another height. detail: smoothing by twice the radius.
-    scale and surface: of ``systematic``; without it they are left out.
+    on a straight line instead of the surface's arc, is hollow, and lies at another height. detail: smoothing by twice
+    the radius. scale, surface and hollows: of ``systematic``; without it they are left out.
 
     Args:
         points_m: the cloud.
@@ -151,23 +154,25 @@ def size_uncertainty(
         parts["points"] = np.sqrt(np.mean(np.square(sizes[:, 0] - sizes[:, 1]), axis=0)) / 2.0
     surface = surface_and_base(points_m, normals, config)
     usual = size(closed(*surface, config))
-    straight = replace(surface[2], foot_radius_m=surface[2].edge_radius_m)
-    parts["base"] = np.abs(FOOT * (size(closed(*surface[:2], straight, config)) - usual))
+    base = surface[2]
+    others = [replace(base, curvature_per_m=np.zeros_like(base.curvature_per_m)), replace(base, hollow=HOLLOW_BASE)]
+    if systematic is not None and systematic.base_m > 0.0:
+        others.append(replace(base, height_m=base.height_m - systematic.base_m))
+    changes = [size(closed(*surface[:2], other, config)) - usual for other in others]
+    parts["base"] = np.sqrt(np.square(changes).sum(axis=0))
     coarser = replace(config, smoothing_radius_m=COARSER * config.smoothing_radius_m)
     parts["detail"] = np.abs(size(closed(*surface_and_base(points_m, normals, coarser), coarser)) - usual)
     if systematic is not None:
-        if systematic.base_m > 0.0:
-            lower = replace(surface[2], height_m=surface[2].height_m - systematic.base_m)
-            parts["base"] = np.hypot(parts["base"], size(closed(*surface[:2], lower, config)) - usual)
         whole = size_of(mesh)
         parts["scale"] = systematic.scale * np.array(astuple(whole)) * DIMENSIONS
-        parts["surface"] = np.abs(size(offset(mesh, systematic.surface_m)) - np.array(astuple(whole)))
+        for cause, outwards_m in {"surface": systematic.surface_m, "hollows": -systematic.hollow_m}.items():
+            parts[cause] = np.abs(size(offset(mesh, outwards_m)) - np.array(astuple(whole)))
     return {cause: Size(*values.tolist()) for cause, values in parts.items()}
 
 
 def sizes_to_find(splits: int, systematic: SystematicErrors | None) -> int:
     """How many sizes `size_uncertainty` measures."""
-    return 2 * splits + 3 + (0 if systematic is None else 1 + (systematic.base_m > 0.0))
+    return 2 * splits + 4 + (0 if systematic is None else 2 + (systematic.base_m > 0.0))
 
 
 def combined(parts: Mapping[str, Size]) -> Size:
@@ -175,34 +180,38 @@ def combined(parts: Mapping[str, Size]) -> Size:
     return Size(*np.sqrt(np.square([astuple(size) for size in parts.values()]).sum(axis=0)).tolist())
 
 
-def systematic_errors(dataset: PackedDataset, *, base_known: bool) -> SystematicErrors:
-    """What the points of a cloud of this dataset have in common: scale by its poses, the rest by its pixels.
+def systematic_errors(mesh: Mesh, dataset: PackedDataset, *, base_known: bool) -> SystematicErrors:
+    """What the points of a cloud of this dataset have in common: scale by its poses, the rest by its views.
 
     Args:
+        mesh: the closed mesh of the cloud.
         dataset: its ``poses.json`` gives the uncertainty of the scale; without it the scale is taken for exact.
         base_known: whether the height that the object stands on is known.
 
     Raises:
-        InputError: ``poses.json`` cannot be read.
+        InputError: ``poses.json`` or a mask cannot be read.
     """
-    pixel_m = pixel_on_object_m(dataset)
+    pixel_m, poses = pixel_on_object_m(dataset), dataset.camera_to_worlds
+    masks = np.stack([dataset.mask_of(frame) for frame in dataset.frames])
     return SystematicErrors(
         scale=scale_uncertainty(dataset.root / "poses.json"),
-        surface_m=SURFACE_PX * pixel_m,
         base_m=0.0 if base_known else UNKNOWN_BASE_PX * pixel_m,
+        surface_m=surface_std_m(mesh, poses[:, :3, 3], pixel_m),
+        hollow_m=hollow_std_m(mesh, masks, poses, dataset.intrinsics, pixel_m),
     )
 
 
 def pixel_on_object_m(dataset: PackedDataset) -> float:
     """Side of a pixel in the middle of the object, as the mean of all frames."""
     centre_m = dataset.object_box_m.mean(axis=0)
-    eyes_m = np.stack([frame.camera_to_world[:3, 3] for frame in dataset.frames])
-    return float(np.linalg.norm(eyes_m - centre_m, axis=1).mean()) / dataset.intrinsics.fl_x
+    return (
+        float(np.linalg.norm(dataset.camera_to_worlds[:, :3, 3] - centre_m, axis=1).mean()) / dataset.intrinsics.fl_x
+    )
 
 
-def offset(mesh: Mesh, distance_m: float) -> Mesh:
+def offset(mesh: Mesh, distance_m: Float[np.ndarray, "v"]) -> Mesh:
     """The mesh with its vertices moved outwards, but none below its base."""
-    vertices = mesh.vertices + distance_m * mesh.vertex_normals()
+    vertices = mesh.vertices + distance_m[:, None] * mesh.vertex_normals()
     vertices[:, 2] = np.maximum(vertices[:, 2], mesh.vertices[:, 2].min())
     return Mesh(vertices, mesh.triangles)
 

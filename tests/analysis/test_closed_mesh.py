@@ -7,9 +7,6 @@ from standing_sphere import RADIUS_M, STAND_M, sphere_points
 from hsi_sc_nerf.analysis.closed_mesh import (
     MeshConfig,
     closed_mesh,
-    find_base,
-    lower_rim,
-    lowest_edge_m,
     open_edges,
     smoothed,
     solid_pieces,
@@ -50,51 +47,6 @@ def test_smoothing_keeps_a_quadric_exactly():
     found, outward = smoothed(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), 0.002)
     np.testing.assert_allclose(found[middle], 0.0, atol=1e-7)
     np.testing.assert_allclose(outward[middle], [[0.0, 0.0, 1.0]], atol=1e-5)
-
-
-def test_base_of_a_cone_goes_straight_on_to_where_it_stands():
-    rng = np.random.default_rng(0)
-    azimuth, z = rng.uniform(0.0, 2.0 * np.pi, 20000), rng.uniform(0.08, 0.12, 20000)
-    radius = 0.01 + 0.5 * (z - 0.07)
-    points = np.stack([0.002 + radius * np.cos(azimuth), -0.001 + radius * np.sin(azimuth), z], axis=-1)
-    normals = np.stack([np.cos(azimuth), np.sin(azimuth), np.full_like(z, -0.5)], axis=-1) / np.sqrt(1.25)
-    base = find_base(points, normals, STAND_M)
-    np.testing.assert_allclose(base.centre_m, [0.002, -0.001], atol=3e-4)
-    np.testing.assert_allclose(base.foot_radius_m, 0.01, atol=1e-3)
-    closing, outward = base.points(0.0005)
-    assert closing[:, 2].min() == pytest.approx(STAND_M)
-    on_floor = closing[:, 2] == closing[:, 2].min()
-    np.testing.assert_allclose(outward[on_floor], np.tile([0.0, 0.0, -1.0], (on_floor.sum(), 1)))
-    floor_m2 = on_floor.sum() * 0.0005**2
-    assert floor_m2 == pytest.approx(np.pi * base.foot_radius_m.mean() ** 2, rel=0.02)
-    assert (outward[~on_floor, 2] < 0.0).all()
-
-
-@pytest.mark.slow
-def test_base_without_a_height_is_where_the_cloud_ends():
-    points, normals = sphere_points(20000, above=-0.6)
-    assert lowest_edge_m(points) == pytest.approx(STAND_M + 0.4 * RADIUS_M, abs=5e-4)
-    mesh = closed_mesh(points, normals, MeshConfig(octree_depth=6))
-    assert mesh.vertices[:, 2].min() == pytest.approx(STAND_M + 0.4 * RADIUS_M, abs=1e-3)
-
-
-@pytest.mark.slow
-def test_a_rim_that_hangs_down_does_not_widen_the_base():
-    points, normals = sphere_points(40000, above=-0.8)
-    edge_m = STAND_M + 0.2 * RADIUS_M
-    azimuth = np.linspace(0.0, 2.0 * np.pi, 2000, endpoint=False)
-    out = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)], axis=-1)
-    hanging = 0.6 * RADIUS_M * out
-    hanging[:, 2] = edge_m - np.random.default_rng(1).uniform(0.0, 0.001, len(hanging))
-    config = MeshConfig(octree_depth=6, base_height_m=STAND_M)
-    clean = closed_mesh(points, normals, config)
-    with_rim = closed_mesh(np.concatenate([points, hanging]), np.concatenate([normals, out]), config)
-    rim = lower_rim(np.concatenate([points, hanging]), 0.001)
-    assert rim[len(points) :].mean() > 0.98
-    assert rim[: len(points)].mean() < 0.02
-    assert with_rim.area_m2() == pytest.approx(clean.area_m2(), rel=0.005)
-    foot_m = find_base(points[~rim[: len(points)]], normals[~rim[: len(points)]], STAND_M).foot_radius_m
-    assert foot_m.max() < 0.55 * RADIUS_M
 
 
 @pytest.mark.slow
@@ -177,11 +129,3 @@ def test_clouds_that_surround_nothing_or_in_other_units_are_refused(count, scale
     points, normals = sphere_points(count, above=-0.93)
     with pytest.raises(InputError, match=says):
         closed_mesh(scale * points, side * normals, MeshConfig(base_height_m=base_height_m))
-
-
-def test_a_base_a_little_above_the_edge_needs_no_wall():
-    points, normals = sphere_points(20000, above=-0.5)
-    edge_m = STAND_M + 0.5 * RADIUS_M
-    closing, outward = find_base(points, normals, edge_m + 0.002).points(0.0005)
-    np.testing.assert_allclose(closing[:, 2], edge_m + 0.002)
-    np.testing.assert_allclose(outward, np.tile([0.0, 0.0, -1.0], (len(outward), 1)))

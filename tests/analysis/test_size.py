@@ -9,7 +9,6 @@ from standing_sphere import RADIUS_M, STAND_M, sphere_points
 
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed_mesh
 from hsi_sc_nerf.analysis.size import (
-    SURFACE_PX,
     Size,
     SystematicErrors,
     combined,
@@ -20,6 +19,7 @@ from hsi_sc_nerf.analysis.size import (
     sizes_to_find,
     systematic_errors,
 )
+from hsi_sc_nerf.analysis.surface_errors import SURFACE_PX
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.packed.dataset import open_packed
@@ -44,9 +44,11 @@ def test_scatter_from_halves_is_that_of_independent_clouds():
 
 @pytest.mark.slow
 def test_what_points_share_changes_a_sphere_as_calculus_says():
-    systematic = SystematicErrors(scale=0.01, surface_m=0.0003, base_m=0.001)
-    told = []
-    parts = uncertainty(sphere_points(6000, above=-0.93), systematic=systematic, done=told.append)
+    cloud, told = sphere_points(6000, above=-0.93), []
+    mesh = closed_mesh(*cloud, CONFIG)
+    everywhere = np.ones(len(mesh.vertices))
+    systematic = SystematicErrors(0.01, 0.001, surface_m=0.0003 * everywhere, hollow_m=0.0002 * everywhere)
+    parts = size_uncertainty(*cloud, mesh, CONFIG, 0, systematic, told.append)
     assert told[-1] == sizes_to_find(0, systematic)
     area_m2, volume_l = 4 * np.pi * RADIUS_M**2, 4000 * np.pi * RADIUS_M**3 / 3
     assert parts["scale"].area_m2 == pytest.approx(0.02 * area_m2, rel=0.02)
@@ -54,6 +56,7 @@ def test_what_points_share_changes_a_sphere_as_calculus_says():
     assert parts["scale"].height_m == pytest.approx(0.01 * 2 * RADIUS_M, rel=0.02)
     assert parts["surface"].volume_l == pytest.approx(1000 * area_m2 * 0.0003, rel=0.05)
     assert parts["surface"].largest_diameter_m == pytest.approx(0.0006, rel=0.05)
+    assert parts["hollows"].volume_l == pytest.approx(1000 * area_m2 * 0.0002, rel=0.05)
     # The base does not move down: the sphere grows at its top alone.
     assert parts["surface"].height_m == pytest.approx(0.0003, rel=0.1)
     assert parts["base"].height_m == pytest.approx(0.001, rel=0.2)
@@ -84,7 +87,7 @@ def test_causes_add_up_in_squares():
 
 def test_an_offset_base_stays_on_what_it_stands_on():
     mesh = closed_mesh(*sphere_points(6000, above=-0.8), CONFIG)
-    moved = offset(mesh, 0.001)
+    moved = offset(mesh, np.full(len(mesh.vertices), 0.001))
     assert moved.vertices[:, 2].min() == pytest.approx(mesh.vertices[:, 2].min(), abs=2e-4)
     assert np.ptp(moved.vertices[:, 0]) == pytest.approx(np.ptp(mesh.vertices[:, 0]) + 0.002, abs=2e-4)
 
@@ -93,12 +96,14 @@ def test_a_dataset_tells_scale_and_pixels(tmp_path):
     dataset = open_packed(write_ball_dataset(tmp_path))
     eye_m = dataset.frames[0].camera_to_world[:3, 3]
     pixel_m = np.linalg.norm(eye_m - dataset.object_box_m.mean(axis=0)) / dataset.intrinsics.fl_x
-    known, unknown = (systematic_errors(dataset, base_known=known) for known in (True, False))
+    mesh = closed_mesh(*sphere_points(3000, above=-0.93), CONFIG)
+    known, unknown = (systematic_errors(mesh, dataset, base_known=known) for known in (True, False))
     assert known.scale == 0.0
-    assert known.surface_m == pytest.approx(SURFACE_PX * pixel_m, rel=0.02)
+    assert known.surface_m.min() == pytest.approx(SURFACE_PX * pixel_m, rel=0.02)
+    assert known.hollow_m.shape == known.surface_m.shape == (len(mesh.vertices),)
     assert unknown.base_m > known.base_m
     write_json(dataset.root / "poses.json", {"scale": {"uncertainty_percent": 0.5}})
-    assert systematic_errors(dataset, base_known=True).scale == pytest.approx(0.005)
+    assert systematic_errors(mesh, dataset, base_known=True).scale == pytest.approx(0.005)
 
 
 @pytest.mark.parametrize(
