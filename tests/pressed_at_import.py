@@ -1,12 +1,12 @@
 """A process in which Ctrl-C comes just when a library is about to be loaded."""
 
 import os
-import signal
 import subprocess
 import sys
 
 _PRESSES = """
 import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell has it ignored in the background
 library, *sys.argv = sys.argv[1:]
 class Presses:
     def find_spec(self, name, path=None, target=None):
@@ -23,6 +23,4 @@ def run(library, code, words):
         stderr=subprocess.PIPE,
         text=True,
         env=os.environ | {"TERM": "dumb"},
-        # Tests may run in the background of a shell, which has it ignored.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
