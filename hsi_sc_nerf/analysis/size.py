@@ -15,7 +15,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed, closed_mesh, surface_and_base
-from hsi_sc_nerf.analysis.surface_errors import hollow_std_m, surface_std_m
+from hsi_sc_nerf.analysis.surface_errors import hollow_std_m, most_frontal_cosine, surface_std_m
 from hsi_sc_nerf.files import content_of, read_json
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.packed.dataset import PackedDataset
@@ -152,21 +152,20 @@ def size_uncertainty(
         sizes = np.array([[size(closed_mesh(points_m[h], normals[h], config)) for h in pair] for pair in halves])
         # Half the difference of halves scatters as the whole. A bootstrap would scatter less: thinning merges points.
         parts["points"] = np.sqrt(np.mean(np.square(sizes[:, 0] - sizes[:, 1]), axis=0)) / 2.0
-    surface = surface_and_base(points_m, normals, config)
-    usual = size(closed(*surface, config))
-    base = surface[2]
+    seen, outward, base = surface_and_base(points_m, normals, config)
+    usual = size(closed(seen, outward, base, config))
     others = [replace(base, curvature_per_m=np.zeros_like(base.curvature_per_m)), replace(base, hollow=HOLLOW_BASE)]
     if systematic is not None and systematic.base_m > 0.0:
         others.append(replace(base, height_m=base.height_m - systematic.base_m))
-    changes = [size(closed(*surface[:2], other, config)) - usual for other in others]
+    changes = [size(closed(seen, outward, other, config)) - usual for other in others]
     parts["base"] = np.sqrt(np.square(changes).sum(axis=0))
     coarser = replace(config, smoothing_radius_m=COARSER * config.smoothing_radius_m)
     parts["detail"] = np.abs(size(closed(*surface_and_base(points_m, normals, coarser), coarser)) - usual)
     if systematic is not None:
-        whole = size_of(mesh)
-        parts["scale"] = systematic.scale * np.array(astuple(whole)) * DIMENSIONS
+        whole = np.array(astuple(size_of(mesh)))
+        parts["scale"] = systematic.scale * whole * DIMENSIONS
         for cause, outwards_m in {"surface": systematic.surface_m, "hollows": -systematic.hollow_m}.items():
-            parts[cause] = np.abs(size(offset(mesh, outwards_m)) - np.array(astuple(whole)))
+            parts[cause] = np.abs(size(offset(mesh, outwards_m)) - whole)
     return {cause: Size(*values.tolist()) for cause, values in parts.items()}
 
 
@@ -193,11 +192,12 @@ def systematic_errors(mesh: Mesh, dataset: PackedDataset, *, base_known: bool) -
     """
     pixel_m, poses = pixel_on_object_m(dataset), dataset.camera_to_worlds
     masks = np.stack([dataset.mask_of(frame) for frame in dataset.frames])
+    cosine = most_frontal_cosine(mesh, poses[:, :3, 3])
     return SystematicErrors(
         scale=scale_uncertainty(dataset.root / "poses.json"),
         base_m=0.0 if base_known else UNKNOWN_BASE_PX * pixel_m,
-        surface_m=surface_std_m(mesh, poses[:, :3, 3], pixel_m),
-        hollow_m=hollow_std_m(mesh, masks, poses, dataset.intrinsics, pixel_m),
+        surface_m=surface_std_m(cosine, pixel_m),
+        hollow_m=hollow_std_m(mesh, cosine, masks, poses, dataset.intrinsics, pixel_m),
     )
 
 

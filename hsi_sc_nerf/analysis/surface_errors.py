@@ -21,19 +21,19 @@ _DEEPEST_PX = 12
 """Depths below the visual hull are followed this far."""
 
 
-def surface_std_m(mesh: Mesh, eyes_m: Float[np.ndarray, "frames 3"], pixel_m: float) -> Float[np.ndarray, "v"]:
+def surface_std_m(cosine: Float[np.ndarray, "v"], pixel_m: float) -> Float[np.ndarray, "v"]:
     """Standard deviation of the place of each vertex along its normal, but for hollows (`hollow_std_m`).
 
     Args:
-        mesh: with outward normals, object frame.
-        eyes_m: places of the cameras.
+        cosine: `most_frontal_cosine` of the vertices.
         pixel_m: side of a pixel on the object.
     """
-    return SURFACE_PX * pixel_m / np.maximum(most_frontal_cosine(mesh, eyes_m), MOST_OBLIQUE)
+    return SURFACE_PX * pixel_m / np.maximum(cosine, MOST_OBLIQUE)
 
 
 def hollow_std_m(
     mesh: Mesh,
+    cosine: Float[np.ndarray, "v"],
     masks: Bool[np.ndarray, "frames h w"],
     camera_to_worlds: Float[np.ndarray, "frames 4 4"],
     intrinsics: PinholeIntrinsics,
@@ -46,6 +46,7 @@ def hollow_std_m(
 
     Args:
         mesh: with outward normals, object frame.
+        cosine: `most_frontal_cosine` of its vertices.
         masks: true on the object.
         camera_to_worlds: poses, OpenGL axes.
         intrinsics: of the one camera; lens distortion is neglected.
@@ -53,7 +54,7 @@ def hollow_std_m(
     """
     normals = mesh.vertex_normals()
     depth_px = np.zeros(len(normals))
-    below = np.flatnonzero(most_frontal_cosine(mesh, camera_to_worlds[:, :3, 3]) > MOST_OBLIQUE)
+    below = np.flatnonzero(cosine > MOST_OBLIQUE)
     for step_px in range(1, _DEEPEST_PX + 1):
         moved = mesh.vertices[below] + step_px * pixel_m * normals[below]
         in_image, in_mask = silhouette_counts(

@@ -30,9 +30,14 @@ def outward(mesh: Mesh) -> np.ndarray:
     return (mesh.vertices - factory.SPHERE_CENTRE_M) / factory.SPHERE_RADIUS_M
 
 
+def hollow_of(mesh: Mesh, masks: np.ndarray) -> np.ndarray:
+    cosine = most_frontal_cosine(mesh, POSES[:, :3, 3])
+    return hollow_std_m(mesh, cosine, masks, POSES, factory.INTRINSICS, PIXEL_M)
+
+
 def test_the_more_obliquely_a_surface_is_seen_the_less_is_known_of_its_place():
     mesh = ball()
-    std_m = surface_std_m(mesh, POSES[:, :3, 3], PIXEL_M)
+    std_m = surface_std_m(most_frontal_cosine(mesh, POSES[:, :3, 3]), PIXEL_M)
     towards = POSES[:, None, :3, 3] - mesh.vertices
     towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
     cosine = np.einsum("fvi,vi->fv", towards, outward(mesh)).max(axis=0)
@@ -45,7 +50,7 @@ def test_a_dent_is_uncertain_by_its_depth_below_the_outlines():
     mesh, masks = ball(), np.stack([factory.sphere_mask(pose) for pose in POSES])
     side = outward(mesh) @ [1.0, 0.0, 0.0] > 0.95
     dented = Mesh(mesh.vertices - 5.0 * PIXEL_M * side[:, None] * outward(mesh), mesh.triangles)
-    whole, hollow = (hollow_std_m(one, masks, POSES, factory.INTRINSICS, PIXEL_M) for one in (mesh, dented))
+    whole, hollow = (hollow_of(one, masks) for one in (mesh, dented))
     assert whole.max() <= HOLLOW_FRACTION * PIXEL_M
     assert (whole > 0.0).mean() < 0.02
     middle = outward(mesh) @ [1.0, 0.0, 0.0] > 0.97
@@ -58,7 +63,7 @@ def test_a_dent_is_uncertain_by_its_depth_below_the_outlines():
 def test_where_no_camera_looks_the_hull_tells_of_no_hollow():
     mesh = ball()
     masks = np.ones((len(POSES), factory.INTRINSICS.h, factory.INTRINSICS.w), bool)
-    std_m = hollow_std_m(mesh, masks, POSES, factory.INTRINSICS, PIXEL_M)
+    std_m = hollow_of(mesh, masks)
     unseen = most_frontal_cosine(mesh, POSES[:, :3, 3]) <= MOST_OBLIQUE
     assert unseen.any()
     assert (std_m[unseen] == 0.0).all()
