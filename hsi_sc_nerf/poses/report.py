@@ -258,7 +258,8 @@ def draw_poses(poses: TurntablePoses, report: dict, path: Path) -> None:
     index = np.arange(len(poses.names))
     error.bar(index[poses.used], poses.reprojection_error_px[poses.used], color=COLOURS[0])
     left_out = index[~poses.used]
-    error.plot(left_out, np.zeros(len(left_out)), "x", color=COLOURS[1], label="left out", clip_on=False)
+    if left_out.size:  # an unclipped line without points would lie in the figure's corner, and shrink all axes
+        error.plot(left_out, np.zeros(len(left_out)), "x", color=COLOURS[1], label="left out", clip_on=False)
     error.axhline(REPROJECTION_TARGET_PX, color="black", linestyle="--", label="target")
     if np.isfinite(poses.overall_error_px):
         # Far below the target, the frames are compared with each other.

@@ -14,10 +14,12 @@ from exact_turntable import (
     pose_errors,
     started,
 )
+from PIL import Image, ImageColor
 from turntable_scene import MarkerScene
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.plotting import COLOURS
 from hsi_sc_nerf.poses.marker_poses import poses_from_markers
 from hsi_sc_nerf.poses.report import check_poses, draw_poses, pose_report
 from hsi_sc_nerf.poses.result import is_full_turn
@@ -104,6 +106,16 @@ def test_report_is_json_and_says_how_good_the_poses_are(tmp_path):
     draw_poses(poses, report, tmp_path / "poses.png")
     assert [path.name for path in tmp_path.iterdir()] == ["poses.png"]
     assert (tmp_path / "poses.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+def test_picture_of_poses_has_axes_where_no_frame_is_left_out(tmp_path):
+    _, poses = estimated(size_px=128, frames=9)
+    assert poses.used.all()
+    draw_poses(poses, pose_report(poses, SessionInfo(), []), tmp_path / "poses.png")
+    picture = np.array(Image.open(tmp_path / "poses.png").convert("RGB"))
+    drawn = np.flatnonzero((picture == ImageColor.getrgb(COLOURS[0])).all(axis=-1).any(axis=1))
+    assert len(drawn) > 0.3 * len(picture)  # bars and points fill the height
 
 
 def test_full_turn_is_told_from_a_partial_one():
