@@ -115,6 +115,24 @@ def spectral_angle_map(predicted: Image, target: Image, valid: Valid | None = No
     return angles if valid is None else torch.where(has_angle(valid), angles, torch.nan)
 
 
+def noise_angle(
+    spectra: Float[Tensor, "*pixels bands"], noise_std: Float[Tensor, "bands"]
+) -> Float[Tensor, "*pixels"]:
+    """Root mean square spectral angle (rad) that small noise, independent by band, turns these spectra by.
+
+    Noise along a spectrum changes its length alone, so ``angle^2 = sum(std^2 (1 - u^2)) / length^2`` for the unit
+    spectrum u. It is infinite for a spectrum of zeros.
+
+    Example:
+        >>> noise_angle(torch.full((100,), 0.5), torch.full((100,), 0.01))  # 0.01 sqrt(99) / (0.5 sqrt(100))
+        tensor(0.0199)
+    """
+    power, variance = spectra.double() ** 2, noise_std.double() ** 2
+    length2 = power.sum(-1)
+    across = variance.sum() - (power * variance).sum(-1) / length2.clamp(min=torch.finfo(torch.float64).tiny)
+    return (across.clamp(min=0.0) / length2).sqrt().float()
+
+
 def squared_error_map(predicted: Image, target: Image, valid: Valid | None = None) -> Float[Tensor, "h w"]:
     """Mean squared error over the bands of each pixel, float64; NaN where none is valid."""
     return torch.cat(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -16,6 +17,7 @@ from hsi_sc_nerf.evaluation.spectral_metrics import (
     decibel,
     metrics_of_regions,
     moment_scores,
+    noise_angle,
     spectral_angle_map,
     squared_error_map,
 )
@@ -63,8 +65,10 @@ def _held_out_view(run: TrainedRun, index: int) -> HeldOutView:
     measured, mask = batch["spectral"].cpu(), batch["mask"].cpu()[..., 0].bool()
     valid = batch["valid"].cpu() if "valid" in batch else torch.ones_like(measured, dtype=torch.bool)
     radius_px = max(1.0, mask.shape[1] * _POINT_RADIUS)
+    noise_std = run.dataset.typical_uncertainty
+    known = None if noise_std is None else torch.from_numpy(noise_std)
     return HeldOutView(
-        score_view(manager.eval_dataset.frames[index].capture, rendered, measured, mask, valid),
+        score_view(manager.eval_dataset.frames[index].capture, rendered, measured, mask, valid, known),
         measured[..., model.rgb_bands].numpy(),
         rendered[..., model.rgb_bands].numpy(),
         point_spectra(
@@ -90,6 +94,7 @@ class ViewScores:
         angle_rad: map of the spectral angle; NaN where too few bands are valid.
         error: map of the root mean square error over bands, reflectance; NaN where no band is valid.
         mask: True on the object.
+        noise_angle_rad: spectral angle by the noise of the measurement, median over the object; NaN if not known.
     """
 
     name: str
@@ -100,6 +105,7 @@ class ViewScores:
     angle_rad: Float[np.ndarray, "h w"]
     error: Float[np.ndarray, "h w"]
     mask: Bool[np.ndarray, "h w"]
+    noise_angle_rad: float = math.nan
 
 
 def score_view(
@@ -108,8 +114,13 @@ def score_view(
     measured: Float[Tensor, "h w bands"],
     mask: Bool[Tensor, "h w"],
     valid: Bool[Tensor, "h w bands"],
+    noise_std: Float[Tensor, "bands"] | None = None,
 ) -> ViewScores:
-    """Scores of a view, with the paper's metrics (section "Evaluation Metrics")."""
+    """Scores of a view, with the paper's metrics (section "Evaluation Metrics").
+
+    Args:
+        noise_std: of the measured reflectance, by band.
+    """
     pixels, mse, ssim = (scores[0] for scores in moment_scores(rendered, measured, [mask], valid))
     mse, psnr_db, ssim = (np.where(pixels > 0, score, np.nan) for score in (mse, decibel(mse), ssim))
     return ViewScores(
@@ -121,7 +132,16 @@ def score_view(
         angle_rad=spectral_angle_map(rendered, measured, valid).cpu().numpy(),
         error=squared_error_map(rendered, measured, valid).sqrt().cpu().numpy(),
         mask=mask.cpu().numpy(),
+        noise_angle_rad=_noise_angle_rad(rendered, mask, noise_std),
     )
+
+
+def _noise_angle_rad(
+    rendered: Float[Tensor, "h w bands"], mask: Bool[Tensor, "h w"], noise_std: Float[Tensor, "bands"] | None
+) -> float:
+    if noise_std is None:
+        return math.nan
+    return float(noise_angle(rendered[mask], noise_std.to(rendered.device)).nanmedian())
 
 
 def sample_mean_and_sd(

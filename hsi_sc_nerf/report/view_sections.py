@@ -108,18 +108,23 @@ def views_section(views: Sequence[HeldOutView], held_out: int, white: float) -> 
 
 
 def judge_views(views: Sequence[ViewScores]) -> list[Finding]:
-    """The spectral angle of the held-out views that have one."""
+    """The spectral angle of the held-out views that have one, without the noise of the measurement where known."""
     views = [view for view in views if np.isfinite(view.metrics["sam"])]
     if not views:
         sentence = "No held-out view shows anything of the object that was measured; look at the masks."
         return [Finding("spectral-angle", "red", sentence)]
     angles = np.array([view.metrics["sam"] for view in views])
+    beyond, words = float(angles.mean()), ""
+    noise = float(np.mean([view.noise_angle_rad for view in views]))
+    if np.isfinite(noise):
+        beyond = float(np.sqrt(max(beyond**2 - noise**2, 0.0)))
+        words = f", {beyond:.3f} beyond the noise of the measurement"
     sentence = (
-        f"The mean spectral angle is {angles.mean():.3f} rad (good up to {_SAM_RAD[0]:g}; {_SAM_RAD[1]:g} is another "
-        f"material); it is largest in {views[int(angles.argmax())].name}, {angles.max():.3f} rad"
+        f"The mean spectral angle is {angles.mean():.3f} rad{words} (good up to {_SAM_RAD[0]:g}; {_SAM_RAD[1]:g} is "
+        f"another material); it is largest in {views[int(angles.argmax())].name}, {angles.max():.3f} rad"
     )
     advice = "look at the maps, the mask and the pose of that view"
-    return [judged("spectral-angle", float(angles.mean()), _SAM_RAD, sentence, advice)]
+    return [judged("spectral-angle", beyond, _SAM_RAD, sentence, advice)]
 
 
 def white_of(views: Sequence[HeldOutView]) -> float:

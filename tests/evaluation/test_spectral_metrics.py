@@ -31,6 +31,14 @@ IN_PRECISIONS = pytest.mark.parametrize(
 MASKS = pytest.mark.parametrize("mask", [None, blob()], ids=["full", "masked"])
 
 
+def test_noise_turns_a_flat_spectrum_by_what_lies_across_it():
+    angle = metrics.noise_angle(torch.full((2, 100), 0.5), torch.full((100,), 0.01))
+    torch.testing.assert_close(angle, torch.full((2,), 0.01 * math.sqrt(99) / (0.5 * 10)))
+    along = metrics.noise_angle(torch.tensor([0.4, 0.0]), torch.tensor([0.01, 0.0]))
+    assert along == 0.0
+    assert metrics.noise_angle(torch.zeros(3), torch.full((3,), 0.01)) == torch.inf
+
+
 def some_valid() -> torch.Tensor:
     """A fifth flagged; band 4 wholly, pixel (3, 9) but for one band, pixel (3, 10) wholly."""
     valid = torch.rand(H, W, BANDS, generator=torch.Generator().manual_seed(5)) > 0.2

@@ -16,8 +16,11 @@ GROWING = 1000 + 30 * np.arange(8)
 """A part of a turn, from the narrow side of an object to the broad one."""
 
 
-def views(*angles_rad):
-    return [SimpleNamespace(name=f"pear_{i}", metrics={"sam": angle}) for i, angle in enumerate(angles_rad)]
+def views(*angles_rad, noise_rad=np.nan):
+    return [
+        SimpleNamespace(name=f"pear_{i}", metrics={"sam": angle}, noise_angle_rad=noise_rad)
+        for i, angle in enumerate(angles_rad)
+    ]
 
 
 def point(factor, measured=True):
@@ -55,6 +58,9 @@ def poses(px, used, *warnings):
         (judge_views(views(0.03, 0.04)), ["green"], "pear_1, 0.040"),
         (judge_views(views(0.09, 0.04)), ["amber"], "pear_0, 0.090"),
         (judge_views(views(0.2)), ["red"], "0.200"),
+        (judge_views(views(0.125, noise_rad=0.12)), ["green"], "0.125 rad, 0.035 beyond the noise"),
+        (judge_views(views(0.13, noise_rad=0.05)), ["red"], "0.120 beyond the noise"),
+        (judge_views(views(0.03, noise_rad=0.05)), ["green"], "0.000 beyond the noise"),
         (judge_views(views(np.nan, 0.04)), ["green"], "The mean spectral angle is 0.040"),
         (judge_views(views(np.nan, np.nan)), ["red"], "No held-out view"),
         (judge_bands(np.array([np.nan, np.nan]), NM[:2]), [], ""),

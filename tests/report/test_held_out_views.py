@@ -43,6 +43,19 @@ def test_a_view_that_is_off_by_a_constant(device):
     assert object_angles([view]).mean() == pytest.approx(view.metrics["sam"], abs=1e-6)
 
 
+def test_a_view_says_how_far_its_noise_turns_spectra(device):
+    generator = torch.Generator().manual_seed(0)
+    rendered = 0.2 + 0.6 * torch.rand(30, 30, 50, generator=generator)
+    noise_std = torch.linspace(0.002, 0.02, 50)
+    measured = rendered + noise_std * torch.randn(rendered.shape, generator=generator)
+    mask, valid = torch.ones(30, 30, dtype=torch.bool), torch.ones_like(rendered, dtype=torch.bool)
+    view = score_view("a", *(t.to(device) for t in (rendered, measured, mask, valid, noise_std)))
+    assert view.noise_angle_rad == pytest.approx(view.metrics["sam"], rel=0.02)
+    assert np.isnan(score_view("a", rendered, measured, mask, valid).noise_angle_rad)
+    empty = torch.zeros_like(mask)
+    assert np.isnan(score_view("a", rendered, measured, empty, valid, noise_std).noise_angle_rad)
+
+
 def test_mean_and_deviation_over_the_views_that_have_a_band():
     mean, sd = sample_mean_and_sd(np.array([[1.0, np.nan, 5.0], [3.0, np.nan, np.nan]]))
     np.testing.assert_allclose(mean, [2.0, np.nan, 5.0])
@@ -151,7 +164,8 @@ def test_the_cubes_of_a_view_are_freed_before_the_next_is_rendered():
     manager = SimpleNamespace(
         eval_dataset=SimpleNamespace(frames=frames), fixed_indices_eval_dataloader=SimpleNamespace(get_camera=batch)
     )
-    assert len(list(render_held_out(SimpleNamespace(model=model, manager=manager), 3))) == 3
+    run = SimpleNamespace(model=model, manager=manager, dataset=SimpleNamespace(typical_uncertainty=None))
+    assert len(list(render_held_out(run, 3))) == 3
     assert len(cubes) == 6
 
 
