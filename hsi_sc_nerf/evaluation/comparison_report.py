@@ -259,7 +259,7 @@ def _draw_distances(
     width, height = 1000 * (high[1] - low[1]), 1000 * (high[2] - low[2])
     inch_per_mm = _PANEL_IN / max(width, height)
     panels = len(surfaces) * len(_SIDES)
-    figure = new_figure(panels * (width * inch_per_mm + 0.45) + 1.0, height * inch_per_mm + 0.9)
+    figure = new_figure(panels * (width * inch_per_mm + 0.45) + 1.0, height * inch_per_mm + 1.3)
     rows = figure.subplots(1, panels, squeeze=False, sharey=True)[0]
     for index, (axes, (title, points, distances)) in enumerate(
         zip(rows, (surface for surface in surfaces for _ in _SIDES), strict=True)

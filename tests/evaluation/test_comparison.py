@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 from plyfile import PlyData, PlyElement
 
 from hsi_sc_nerf.cli.clouds import CompareCommand
@@ -112,6 +113,8 @@ def test_the_command_writes_figures_pictures_and_the_cloud(mesh: Path, tmp_path:
     assert (chosen["threshold_m"], chosen["precision"]) == (0.002, 90)
     assert chosen["f_score"] == pytest.approx(2 * 90 * chosen["recall"] / (90 + chosen["recall"]))
     assert numbers["cloud_to_reference"]["largest_m"] == pytest.approx(0.5 * RADIUS_M, rel=0.01)
+    picture = np.array(Image.open(out / "distances.png").convert("L"))
+    assert (picture[[0, 1, -2, -1]] == 255).all()  # neither titles nor labels are cut
     assert "| 2.00 (the paper's) | 90.00 |" in (out / "comparison.md").read_text()
     vertices = PlyData.read(out / "distances.ply")["vertex"]
     assert vertices["scalar_distance_m"][:9000].max() < 1e-5
