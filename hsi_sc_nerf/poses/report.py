@@ -209,7 +209,7 @@ def describe_poses(poses: TurntablePoses, report: dict) -> list[str]:
         parts.append(f"reprojection error {error_px:.2f} px")
     parts += [
         "free poses of a wobbling table" if poses.model == "free poses" else "one axis",
-        f"axis leans {report['axis_tilt_in_image_deg']:.2f}° in the image",
+        f"axis leans {round(report['axis_tilt_in_image_deg'], 2) + 0.0:.2f}° in the image",  # not -0.00
         f"camera looks down {report['camera_looks_down_deg']:.2f}°",
     ]
     if report["axis_tilt_to_disc_deg"] is not None:

@@ -145,6 +145,8 @@ def lamp_drift(drift: LampDriftEstimate | NotMeasurable, corrected: bool) -> Eff
     done = "corrected" if corrected else "not corrected"
     evidence = max(0.0, -float(np.log10(max(drift.p_value, 1e-99))))
     sentence = f"The lamps changed by up to {largest:+.2f} %, which calibration has {done}."
+    if not (corrected or drift.significant):
+        sentence = "The frames show no change of the lamps beyond noise."
     return EffectEvidence(
         "lamp_drift", corrected, evidence, _LOG_P_NOISE, float(-np.log10(SIGNIFICANCE)), "-log10 p", sentence
     )

@@ -76,7 +76,9 @@ def test_what_calibration_and_poses_decided_is_reported():
     assert (lamp_drift(drift, True).present, lamp_drift(drift, False).present) == (True, False)
     assert lamp_drift(drift, True).evidence == pytest.approx(8.0)
     assert "-5.00 %" in lamp_drift(drift, True).sentence
-    assert lamp_drift(replace(drift, p_value=1.0), False).evidence == 0.0
+    assert "-5.00 %, which calibration has not corrected" in lamp_drift(drift, False).sentence
+    steady = lamp_drift(replace(drift, p_value=1.0), False)
+    assert (steady.evidence, steady.sentence) == (0.0, "The frames show no change of the lamps beyond noise.")
     assert lamp_drift(NotMeasurable("it is dark"), False).evidence is None
     found = poses(evidence={"lens_distortion": 20.0, "wobble": 1.0}, distortion=(-0.1, 0.0, 0.0, 0.0))
     lens, table = lens_distortion(found), wobble(found)
