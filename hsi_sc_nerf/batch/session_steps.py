@@ -95,7 +95,8 @@ class SessionSettings:
     """What a user may choose of the steps."""
 
     preset: Preset = "balanced"
-    """How long to train; the times are in docs/validation/accuracy_and_time.md."""
+    """How long to train: fast for a first look (a hollow may stay closed), balanced, or best, which gains little
+    without a GPU; the times are in docs/validation/accuracy_and_time.md."""
     max_num_iterations: int | None = between(1, math.inf, default=None)
     """Training steps of both stages together, in place of the preset's."""
     num_points: int = between(1, math.inf, default=200_000)
