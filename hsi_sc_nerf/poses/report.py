@@ -209,11 +209,11 @@ def describe_poses(poses: TurntablePoses, report: dict) -> list[str]:
         parts.append(f"reprojection error {error_px:.2f} px")
     parts += [
         "free poses of a wobbling table" if poses.model == "free poses" else "one axis",
-        f"axis leans {round(report['axis_tilt_in_image_deg'], 2) + 0.0:.2f}° in the image",  # not -0.00
-        f"camera looks down {report['camera_looks_down_deg']:.2f}°",
+        f"axis leans {angle_words(report['axis_tilt_in_image_deg'])} in the image",
+        f"camera looks down {angle_words(report['camera_looks_down_deg'])}",
     ]
     if report["axis_tilt_to_disc_deg"] is not None:
-        parts.append(f"axis tilts {report['axis_tilt_to_disc_deg']:.2f}° to the disc")
+        parts.append(f"axis tilts {angle_words(report['axis_tilt_to_disc_deg'])} to the disc")
     if report["loop_closure_deg"] is not None:
         parts.append(f"loop closes to {abs(report['loop_closure_deg']):.3f}°")
     scale = poses.scale
@@ -226,6 +226,11 @@ def describe_poses(poses: TurntablePoses, report: dict) -> list[str]:
     if poses.outliers:
         parts.append(f"{len(poses.outliers)} observations of markers left out")
     return parts
+
+
+def angle_words(angle_deg: float) -> str:
+    """The angle with two decimals; what rounds to zero has no sign."""
+    return f"{round(angle_deg, 2) + 0.0:.2f}°"
 
 
 @rc_context(STYLE)

@@ -140,13 +140,13 @@ def lamp_drift(drift: LampDriftEstimate | NotMeasurable, corrected: bool) -> Eff
         return EffectEvidence(
             "lamp_drift", False, None, None, None, "-log10 p", f"Its drift was not measured: {drift.reason}."
         )
-    change = 100.0 * (drift.factor - 1.0)
-    largest = float(change.flat[np.abs(change).argmax()])
-    done = "corrected" if corrected else "not corrected"
     evidence = max(0.0, -float(np.log10(max(drift.p_value, 1e-99))))
-    sentence = f"The lamps changed by up to {largest:+.2f} %, which calibration has {done}."
-    if not (corrected or drift.significant):
-        sentence = "The frames show no change of the lamps beyond noise."
+    sentence = "The frames show no change of the lamps beyond noise."
+    if corrected or drift.significant:
+        change = 100.0 * (drift.factor - 1.0)
+        largest = float(change.flat[np.abs(change).argmax()])
+        done = "corrected" if corrected else "not corrected"
+        sentence = f"The lamps changed by up to {largest:+.2f} %, which calibration has {done}."
     return EffectEvidence(
         "lamp_drift", corrected, evidence, _LOG_P_NOISE, float(-np.log10(SIGNIFICANCE)), "-log10 p", sentence
     )

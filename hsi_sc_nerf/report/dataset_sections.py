@@ -13,6 +13,7 @@ from markupsafe import Markup
 from hsi_sc_nerf.files import content_of
 from hsi_sc_nerf.findings import EFFECT_COLUMNS, Finding, effect_rows, judged
 from hsi_sc_nerf.packed.dataset import PackedDataset
+from hsi_sc_nerf.poses.report import angle_words
 from hsi_sc_nerf.poses.result import is_full_turn
 from hsi_sc_nerf.report.charts import Curve, line_chart
 from hsi_sc_nerf.report.page import (
@@ -277,6 +278,8 @@ def _pose_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
     """The entries of poses.json that are there."""
     error, frames, scale = (found.get(key) or {} for key in ("reprojection_error_px", "frames", "scale"))
     uncertainty, steps, lens = (found.get(key) or {} for key in ("uncertainty", "steps_deg", "intrinsics"))
+    angles_deg = (found.get(key) for key in ("camera_looks_down_deg", "axis_tilt_in_image_deg"))
+    down, lean = (None if angle_deg is None else angle_words(angle_deg) for angle_deg in angles_deg)
     candidates: list[tuple[str, str, Any]] = [
         ("found by", "{}", found.get("method")),
         ("frames used", "{} of " + str(frames.get("total")), frames.get("used")),
@@ -285,8 +288,8 @@ def _pose_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("direction, from above", "{}", _DIRECTIONS.get(str((found.get("direction") or {}).get("found")))),
         ("median step", "{:.3f}°", steps.get("median")),
         ("loop closes to", "{:.3f}°", found.get("loop_closure_deg")),
-        ("camera looks down", "{:.2f}°", found.get("camera_looks_down_deg")),
-        ("axis leans in the image", "{:.2f}°", found.get("axis_tilt_in_image_deg")),
+        ("camera looks down", "{}", down),
+        ("axis leans in the image", "{}", lean),
         ("focal length", "{:.1f} px", lens.get("fl_x")),
         ("uncertainty of the focal length", "{:.2f} %", uncertainty.get("focal_percent")),
         ("uncertainty of the distance", "{:.2f} %", uncertainty.get("distance_percent")),

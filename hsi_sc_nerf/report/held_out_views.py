@@ -65,10 +65,10 @@ def _held_out_view(run: TrainedRun, index: int) -> HeldOutView:
     measured, mask = batch["spectral"].cpu(), batch["mask"].cpu()[..., 0].bool()
     valid = batch["valid"].cpu() if "valid" in batch else torch.ones_like(measured, dtype=torch.bool)
     radius_px = max(1.0, mask.shape[1] * _POINT_RADIUS)
-    noise_std = run.dataset.typical_uncertainty
-    known = None if noise_std is None else torch.from_numpy(noise_std)
+    noise = run.dataset.typical_uncertainty
+    noise_std = None if noise is None else torch.from_numpy(noise)
     return HeldOutView(
-        score_view(manager.eval_dataset.frames[index].capture, rendered, measured, mask, valid, known),
+        score_view(manager.eval_dataset.frames[index].capture, rendered, measured, mask, valid, noise_std),
         measured[..., model.rgb_bands].numpy(),
         rendered[..., model.rgb_bands].numpy(),
         point_spectra(

@@ -117,7 +117,7 @@ def judge_views(views: Sequence[ViewScores]) -> list[Finding]:
     beyond, words = float(angles.mean()), ""
     noise = float(np.mean([view.noise_angle_rad for view in views]))
     if np.isfinite(noise):
-        beyond = float(np.sqrt(max(beyond**2 - noise**2, 0.0)))
+        beyond = float(_beyond_noise(angles.mean(), noise))
         words = f", {beyond:.3f} beyond the noise of the measurement"
     sentence = (
         f"The mean spectral angle is {angles.mean():.3f} rad{words} (good up to {_SAM_RAD[0]:g}; {_SAM_RAD[1]:g} is "
@@ -213,7 +213,7 @@ def judge_bands(
     """The band with the largest error, without the noise of the measurement where that is known, if there is any."""
     if np.isnan(rmse).all():
         return []
-    beyond = rmse if noise is None else np.sqrt(np.maximum(rmse**2 - noise**2, 0.0))
+    beyond = rmse if noise is None else _beyond_noise(rmse, noise)
     worst = int(np.nanargmax(beyond))
     sentence = (
         f"The RMSE of reflectance is {np.nanmean(rmse):.3f}, and in no band above {beyond[worst]:.3f}"
@@ -221,6 +221,11 @@ def judge_bands(
         f"up to {_RMSE[0]:g})"
     )
     return [judged("rmse", float(beyond[worst]), _RMSE, sentence, "train longer, or look at the maps of the error")]
+
+
+def _beyond_noise(error: np.ndarray, noise: np.ndarray | float) -> np.ndarray:
+    """What is left of root mean square errors without the noise in them; 0 where that is all."""
+    return np.sqrt(np.maximum(error**2 - noise**2, 0.0))
 
 
 def spectra_section(view: HeldOutView, wavelengths_nm: Float[np.ndarray, "bands"], white: float) -> Section:

@@ -21,7 +21,7 @@ from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.plotting import COLOURS
 from hsi_sc_nerf.poses.marker_poses import poses_from_markers
-from hsi_sc_nerf.poses.report import check_poses, draw_poses, pose_report
+from hsi_sc_nerf.poses.report import angle_words, check_poses, draw_poses, pose_report
 from hsi_sc_nerf.poses.result import is_full_turn
 
 INFO = SessionInfo(marker_side_m=SIDE_M)
@@ -116,6 +116,10 @@ def test_picture_of_poses_has_axes_where_no_frame_is_left_out(tmp_path):
     picture = np.array(Image.open(tmp_path / "poses.png").convert("RGB"))
     drawn = np.flatnonzero((picture == ImageColor.getrgb(COLOURS[0])).all(axis=-1).any(axis=1))
     assert len(drawn) > 0.3 * len(picture)  # bars and points fill the height
+
+
+def test_an_angle_that_rounds_to_zero_has_no_sign():
+    assert [angle_words(angle) for angle in (-0.001, -0.0, 0.004, -1.234)] == ["0.00°", "0.00°", "0.00°", "-1.23°"]
 
 
 def test_full_turn_is_told_from_a_partial_one():
