@@ -103,6 +103,21 @@ def fit_light(
     return fit.result(fit.covariance())
 
 
+def newton_step(
+    hessian: Float[np.ndarray, "n n"], gradient: Float[np.ndarray, "n"], bounds: tuple[float, float]
+) -> Float[np.ndarray, "n"]:
+    """The step that minimises ``step @ hessian @ step / 2 - gradient @ step``, its last element within bounds.
+
+    At a bound, the other elements are those that fit it. If the last one were cut after all of them are found, they
+    would go on making up for what is cut.
+    """
+    step = np.linalg.solve(hessian, gradient)
+    last = np.clip(step[-1], *bounds)
+    if last == step[-1]:
+        return step
+    return np.append(np.linalg.solve(hessian[:-1, :-1], gradient[:-1] - hessian[:-1, -1] * last), last)
+
+
 class _LightFitting(MaterialFitting):
     """State of the fit: the light, and what follows from it."""
 
@@ -135,7 +150,7 @@ class _LightFitting(MaterialFitting):
             information, known = self.errors.information(residual[:, 0], jacobian, self.precision)
             prior, pull = self._prior()
             hessian = information + prior
-            step = np.linalg.solve(hessian, known + pull)
+            step = self._step(hessian, known + pull)
             self._move(step)
             if estimate_unevenness:
                 self._estimate_unevenness(np.linalg.inv(hessian))
@@ -211,6 +226,13 @@ class _LightFitting(MaterialFitting):
         std = np.hypot(WHITE_STD, 2.0 * light.nearness * by_lamps * WHITE_PLACE_STD_M)
         return np.diag(precision) + np.outer(white, white) / std**2, white * missing / std**2 - precision * now
 
+    def _step(self, hessian: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        """The Gauss-Newton step, to lamps neither nearer than ``LEAST_DISTANCE_M`` nor beyond infinity."""
+        if not len(self.light.lamps):
+            return np.linalg.solve(hessian, gradient)
+        nearness = self.light.nearness
+        return newton_step(hessian, gradient, (-nearness, 1.0 / LEAST_DISTANCE_M - nearness))
+
     def _move(self, step: np.ndarray) -> None:
         """Change the parameters; lamps stay positive, and turn by no more than ``LARGEST_TURN_RAD`` at once."""
         light, lamps = self.light, len(self.light.lamps)
@@ -224,7 +246,7 @@ class _LightFitting(MaterialFitting):
                 chamber=light.chamber + step[:TERMS],
                 lamps=np.maximum(light.lamps + step[TERMS : TERMS + lamps], 0.1 * light.lamps),
                 to_lamps=unit_vectors(to_lamps),
-                nearness=float(np.clip(light.nearness + step[-1], 0.0, 1.0 / LEAST_DISTANCE_M)) if lamps else 0.0,
+                nearness=max(float(light.nearness + step[-1]), 0.0) if lamps else 0.0,
             )
         )
 

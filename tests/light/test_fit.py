@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from light_on_a_ball import FACING, TO_LAMP, measured, turning_ball
+from scipy.optimize import lsq_linear
 
-from hsi_sc_nerf.light.fit import fit_light
+from hsi_sc_nerf.light.fit import fit_light, newton_step
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +69,17 @@ def test_a_near_lamp_is_found_to_be_near():
         assert found.light.nearness == pytest.approx(1.0 / distance_m, abs=0.4)
         ratio = (found.material / material)[seen_rows(views, parts)]
         assert np.quantile(np.abs(ratio - 1.0), 0.9) < 0.05
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_step_to_a_bound_is_the_least_there(seed):
+    rng = np.random.default_rng(seed)
+    jacobian, residual, bound = rng.normal(size=(9, 4)), rng.normal(size=9), rng.uniform(0.0, 0.1)
+    step = newton_step(jacobian.T @ jacobian, jacobian.T @ residual, (-bound, bound))
+    free = np.full(3, np.inf)
+    slow = lsq_linear(jacobian, residual, (np.append(-free, -bound), np.append(free, bound)), tol=1e-14)
+    np.testing.assert_allclose(step, slow.x, atol=1e-6)
+    assert step[-1] in {-bound, bound}
 
 
 @pytest.mark.slow
