@@ -72,14 +72,17 @@ def test_a_near_lamp_is_found_to_be_near():
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_step_to_a_bound_is_the_least_there(seed):
+def test_a_step_within_bounds_is_the_least_there(seed):
     rng = np.random.default_rng(seed)
-    jacobian, residual, bound = rng.normal(size=(9, 4)), rng.normal(size=9), rng.uniform(0.0, 0.1)
-    step = newton_step(jacobian.T @ jacobian, jacobian.T @ residual, (-bound, bound))
-    free = np.full(3, np.inf)
-    slow = lsq_linear(jacobian, residual, (np.append(-free, -bound), np.append(free, bound)), tol=1e-14)
-    np.testing.assert_allclose(step, slow.x, atol=1e-6)
-    assert step[-1] in {-bound, bound}
+    jacobian, residual = rng.normal(size=(9, 4)), rng.normal(size=9)
+    hessian, gradient = jacobian.T @ jacobian, jacobian.T @ residual
+    unbounded = np.linalg.solve(hessian, gradient)
+    for fraction in (0.5, 2.0):
+        bound, free = fraction * abs(unbounded[-1]), np.full(3, np.inf)
+        slow = lsq_linear(jacobian, residual, (np.append(-free, -bound), np.append(free, bound)), tol=1e-14)
+        step = newton_step(hessian, gradient, (-bound, bound))
+        np.testing.assert_allclose(step, slow.x, atol=1e-6)
+        assert np.isclose(step[:-1], unbounded[:-1]).all() == (fraction > 1.0)
 
 
 @pytest.mark.slow
