@@ -1,6 +1,7 @@
 """How often the truth lies within the stated uncertainty of sizes and of spots' brightness, over simulated sessions.
 
     uv run python benchmarks/trait_uncertainty.py OUTPUT_DIR
+    uv run python benchmarks/trait_uncertainty.py OUTPUT_DIR --seeds 15 16 17 18
 
 Each session is simulated, processed, trained and exported by the commands that a user would type; what is there is
 not done again. Sessions have even light, photon and read noise. The object stands where the container ends.
@@ -34,7 +35,7 @@ TRAITS = {"area_m2": "area", "volume_l": "volume", "height_m": "height", "larges
 SPOT = "brightness of spots of 10 mm"
 COARSE = "maize"
 """Its kernels are finer than the pixels, so that its area is not measured: rows are also given without it."""
-COLUMNS = ("trait", "sessions", "within 1 std, %", "within 2 std, %", "median error, %", "median stated std, %")
+COLUMNS = ("trait", "seeds", "sessions", "within 1 std, %", "within 2 std, %", "median error, %", "median stated std, %")
 
 
 @dataclass(frozen=True)
@@ -66,11 +67,11 @@ class TraitUncertainty:
                 for trait, error, std in self._measured(folder):
                     print(f"{folder.name}: {trait}: error {100 * error:+.2f} %, stated {100 * std:.2f} %")
                     found.setdefault(trait, []).append((scene, error, std))
-        rows = [_row(trait, values) for trait, values in found.items()]
-        without = {trait: [value for value in values if value[0] != COARSE] for trait, values in found.items()}
-        rows += [_row(f"{trait}, without {COARSE}", values) for trait, values in without.items()]
         seeds = " ".join(map(str, self.seeds))
-        write_results("trait_uncertainty", COLUMNS, rows, seed=seeds, folder=self.results)
+        rows = [_row(trait, seeds, values) for trait, values in found.items()]
+        without = {trait: [value for value in values if value[0] != COARSE] for trait, values in found.items()}
+        rows += [_row(f"{trait}, without {COARSE}", seeds, values) for trait, values in without.items()]
+        write_results("trait_uncertainty", COLUMNS, rows, keys=2, seed=seeds, folder=self.results)
 
     def _measured(self, folder: Path) -> list[tuple[str, float, float]]:
         """`measured`, from the file that keeps it if it is there."""
@@ -119,11 +120,11 @@ def measured(folder: Path) -> Iterator[tuple[str, float, float]]:
         yield SPOT, region.spectrum.mean.mean() / brightness - 1.0, region.reflectance_std / brightness
 
 
-def _row(trait: str, values: Sequence[tuple[str, float, float]]) -> list[str]:
+def _row(trait: str, seeds: str, values: Sequence[tuple[str, float, float]]) -> list[str]:
     sessions = len(values) // (SPOTS if trait.startswith(SPOT) else 1)
     error, std = np.array([value[1:] for value in values]).T
     within = (f"{100 * np.mean(abs(error) <= count * std):.0f}" for count in (1, 2))
-    return [trait, str(sessions), *within, f"{100 * np.median(abs(error)):.2f}", f"{100 * np.median(std):.2f}"]
+    return [trait, seeds, str(sessions), *within, f"{100 * np.median(abs(error)):.2f}", f"{100 * np.median(std):.2f}"]
 
 
 if __name__ == "__main__":
