@@ -35,7 +35,15 @@ TRAITS = {"area_m2": "area", "volume_l": "volume", "height_m": "height", "larges
 SPOT = "brightness of spots of 10 mm"
 COARSE = "maize"
 """Its kernels are finer than the pixels, so that its area is not measured: rows are also given without it."""
-COLUMNS = ("trait", "seeds", "sessions", "within 1 std, %", "within 2 std, %", "median error, %", "median stated std, %")
+COLUMNS = (
+    "trait",
+    "seeds",
+    "sessions",
+    "within 1 std, %",
+    "within 2 std, %",
+    "median error, %",
+    "median stated std, %",
+)
 
 
 @dataclass(frozen=True)

@@ -49,15 +49,12 @@ def clear_floating_matter(model: SpectralModel, manager: SpectralDataManager, st
     """
     grid, cleared = model.occupancy, 0
     assert grid is not None
-    dataset: PackedDataset = manager.train_dataparser_outputs.metadata["dataset"]
-    above_base_m = dataset.object_box_m[0, 2] + HULL_MARGIN_M - dataset.scene_box_m[0, 2]
-    lowest = int(np.ceil(above_base_m / grid_over(dataset.scene_box_m)[1]))
-    for piece, cells in floating_pieces(grid.opacity.numpy(force=True), lowest):
-        pixels = _pixels_that_look_at(piece, manager, step)
+    for piece, cells in floating_pieces(grid.opacity.numpy(force=True), lowest_in_the_air(manager)):
+        pixels = pixels_that_look_at(piece, manager, step)
         if len(pixels):
-            before, errors = grid.opacity.clone(), _squared_errors(model, manager, pixels)
+            before, errors = grid.opacity.clone(), squared_errors(model, manager, pixels)
             grid.clear(torch.from_numpy(cells).to(before.device))
-            rises = _squared_errors(model, manager, pixels) - errors
+            rises = squared_errors(model, manager, pixels) - errors
             if rises.mean() > CLEARLY * rises.std(correction=0) / len(rises) ** 0.5:
                 grid.opacity.copy_(before)
             else:
@@ -91,7 +88,14 @@ def floating_pieces(
     return found
 
 
-def _pixels_that_look_at(
+def lowest_in_the_air(manager: SpectralDataManager) -> int:
+    """The lowest layer of the occupancy grid that lies wholly over what the object stands on."""
+    dataset: PackedDataset = manager.train_dataparser_outputs.metadata["dataset"]
+    above_base_m = dataset.object_box_m[0, 2] + HULL_MARGIN_M - dataset.scene_box_m[0, 2]
+    return int(np.ceil(above_base_m / grid_over(dataset.scene_box_m)[1]))
+
+
+def pixels_that_look_at(
     cells: Bool[np.ndarray, "x y z"], manager: SpectralDataManager, step: int
 ) -> Int[np.ndarray, "at_most_pixels 3"]:
     """Random training pixels (frame, line, sample) that look at cells; lens distortion is neglected."""
@@ -111,7 +115,7 @@ def _pixels_that_look_at(
     return np.concatenate(pixels)
 
 
-def _squared_errors(
+def squared_errors(
     model: SpectralModel, manager: SpectralDataManager, pixels: Int[np.ndarray, "count 3"]
 ) -> Float[torch.Tensor, "count"]:
     """Squared error of the rendered reflectance of each training pixel, mean over its measured bands."""

@@ -19,8 +19,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from hsi_sc_nerf.data.datamanager import SpectralDataManager
 from hsi_sc_nerf.models.floating_matter import CLEAR_EVERY, clear_floating_matter
+from hsi_sc_nerf.models.hull_caps import clear_cap
 from hsi_sc_nerf.models.occupancy_sampler import pixels_with_matter
 from hsi_sc_nerf.models.spectral_model import SpectralModel
+from hsi_sc_nerf.models.stages import GROWN_AFTER
 
 SCENE_BUFFERS = ("aabb", "axis_origin")
 """Buffers that place the scene; weights are meaningless in another scene box."""
@@ -52,15 +54,23 @@ class SpectralPipeline(VanillaPipeline):
             pixels = pixels_with_matter(grid, metadata["dataset"], metadata["frames"])
             self.datamanager.train_pixel_sampler.restrict_background(pixels)
 
-    def prepare_step(self, step: int, last_stage: bool) -> None:
+    def prepare_step(self, step: int, part_of_last_stage: float | None) -> None:
         """Bring the model up to date before a step of training.
 
-        In the last stage, when the surface has formed, what floats in the air is cleared now and then.
+        In the last stage, when the surface has formed, what floats in the air is cleared now and then, and caps over
+        hollows once opacity rises as far as it will.
+
+        Args:
+            step: of training.
+            part_of_last_stage: fraction of the last stage that is done; None before it.
         """
         model = cast(SpectralModel, self.model)
         model.prepare_step(step)
-        if last_stage and step > 0 and step % CLEAR_EVERY == 0 and model.occupancy is not None:
-            clear_floating_matter(model, self.datamanager, step)
+        if part_of_last_stage is None or step == 0 or step % CLEAR_EVERY != 0 or model.occupancy is None:
+            return
+        if part_of_last_stage > GROWN_AFTER:
+            clear_cap(model, self.datamanager, step)
+        clear_floating_matter(model, self.datamanager, step)
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load the weights of a checkpoint that was made with the same model settings and dataset.

@@ -58,6 +58,12 @@ class Schedule:
         """Whether the last step was the run's last."""
         return self.stage_complete and self.stage is self.plan.stages[-1]
 
+    @property
+    def part_of_last_stage(self) -> float | None:
+        """The fraction of the last stage that is done; None before it."""
+        last = self.plan.stages[-1]
+        return (self.position - last.start) / (last.end - last.start) if self.stage is last else None
+
     def require_steps_left(self, steps_done: int) -> int:
         """How many steps may still be taken; a timed run ends by the clock.
 

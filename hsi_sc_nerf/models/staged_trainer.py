@@ -218,7 +218,7 @@ class StagedTrainer(Trainer):
             sampler._step, sampler._steps_since_update = max(0, step - 1), self._steps_since_update
 
         torch.manual_seed(step_seed(self.config.machine.seed, step))
-        self.pipeline.prepare_step(step, last_stage=stage is self.schedule.plan.stages[-1])
+        self.pipeline.prepare_step(step, self.schedule.part_of_last_stage)
         captured = self._captured
         found = super().train_iteration(step) if captured is None else self._captured_iteration(captured, step)
         loss, loss_dict, metrics_dict = found

@@ -229,15 +229,18 @@ def test_nerfstudios_rgba_pictures_are_opaque(pipeline):
     torch.testing.assert_close(rgba, torch.cat([rgb, torch.ones(3, 4, 1)], -1))
 
 
-def test_floating_matter_is_cleared_now_and_then_in_the_last_stage_of_a_model_with_a_grid(monkeypatch):
-    cleared, prepared = [], []
-    monkeypatch.setattr("hsi_sc_nerf.models.pipeline.clear_floating_matter", lambda *words: cleared.append(words[2]))
+def test_floating_matter_and_caps_are_cleared_now_and_then_in_the_last_stage_of_a_model_with_a_grid(monkeypatch):
+    floating, caps, prepared = [], [], []
+    module = "hsi_sc_nerf.models.pipeline"
+    monkeypatch.setattr(f"{module}.clear_floating_matter", lambda *words: floating.append(words[2]))
+    monkeypatch.setattr(f"{module}.clear_cap", lambda *words: caps.append(words[2]))
     model = types.SimpleNamespace(prepare_step=prepared.append, occupancy=object())
     pipeline = types.SimpleNamespace(model=model, datamanager=None)
     for step in (0, 99, 100, 250, 300):
-        SpectralPipeline.prepare_step(pipeline, step, last_stage=True)
-        SpectralPipeline.prepare_step(pipeline, step, last_stage=False)
+        SpectralPipeline.prepare_step(pipeline, step, part_of_last_stage=step / 400)
+        SpectralPipeline.prepare_step(pipeline, step, part_of_last_stage=None)
     model.occupancy = None
-    SpectralPipeline.prepare_step(pipeline, 400, last_stage=True)
-    assert cleared == [100, 300]
+    SpectralPipeline.prepare_step(pipeline, 400, part_of_last_stage=1.0)
+    assert floating == [100, 300]
+    assert caps == [300]
     assert prepared == [0, 0, 99, 99, 100, 100, 250, 250, 300, 300, 400]

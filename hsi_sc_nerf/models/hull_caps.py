@@ -1,0 +1,75 @@
+"""What is left of the visual hull's cap over a hollow, fixed to the hollow's rim.
+
+Masks do not show a hollow that faces upwards, so training begins with a cap over it, a cone as flat as the cameras
+look down. Where the cap stays opaque, no ray shows the hollow, and the object is too tall. Pixels tell the cap from a
+real top: without the top they show the chamber, while what is learned under a cap resembles it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from jaxtyping import Int
+
+from hsi_sc_nerf.data.datamanager import SpectralDataManager
+from hsi_sc_nerf.models.floating_matter import MIN_OPACITY, lowest_in_the_air, pixels_that_look_at, squared_errors
+from hsi_sc_nerf.models.spectral_model import SpectralModel
+
+MOST_RISE = 0.7
+"""The squared errors of pixels that look at a cap rise by this fraction at most without it. They rise by 0.02 to 0.72
+for a layer of a tomato's cap, and by 0.8 to 19 for one of a real top (docs/notes/dead_ends.md)."""
+
+
+@torch.no_grad()
+def clear_cap(model: SpectralModel, manager: SpectralDataManager, step: int) -> None:
+    """Clear what lies over the top of the object for good.
+
+    It is for a late step: while the surface is still too high everywhere, pixels do without the real top as well.
+
+    Args:
+        model: with an occupancy grid.
+        manager: of the training frames.
+        step: of training; the pixels are drawn by it.
+    """
+    grid = model.occupancy
+    assert grid is not None
+    before = grid.opacity.clone()
+    matter = before.numpy(force=True) > MIN_OPACITY
+
+    def rise_without(layer: int) -> float:
+        """Of the squared errors of pixels that look at a layer, those above being cleared."""
+        grid.opacity[..., layer + 1 :] = -1.0
+        pixels = pixels_that_look_at(matter & (np.arange(matter.shape[2]) == layer), manager, step)
+        if not len(pixels):
+            return np.inf
+        errors = squared_errors(model, manager, pixels)
+        grid.opacity[..., layer] = -1.0
+        rises = squared_errors(model, manager, pixels) - errors
+        return float(rises.mean() / errors.mean().clamp_min(1e-12))
+
+    layers = np.flatnonzero(matter.any(axis=(0, 1)))
+    top = top_layer(layers[layers >= lowest_in_the_air(manager)], rise_without)
+    grid.opacity.copy_(before)
+    if top is not None:
+        grid.opacity[..., top + 1 :] = -1.0
+
+
+def top_layer(layers: Int[np.ndarray, "n"], rise_without: Callable[[int], float]) -> int | None:
+    """The lowest layer that pixels do without, in which the top of the object may lie; None if they need the highest.
+
+    Args:
+        layers: that hold matter, upwards.
+        rise_without: fraction by which the squared errors at a layer rise without it; of each layer after those above.
+
+    Example:
+        >>> top_layer(np.arange(8), lambda layer: 0.1 if layer >= 5 else 9.0)
+        5
+    """
+    top = None
+    for layer in map(int, layers[::-1]):
+        if rise_without(layer) > MOST_RISE:
+            break
+        top = layer
+    return top
