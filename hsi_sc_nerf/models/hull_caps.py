@@ -18,8 +18,8 @@ from hsi_sc_nerf.models.floating_matter import MIN_OPACITY, lowest_in_the_air, p
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 
 MOST_RISE = 0.7
-"""The squared errors of pixels that look at a cap rise by this fraction at most without it. They rise by 0.02 to 0.72
-for a layer of a tomato's cap, and by 0.8 to 19 for one of a real top (docs/notes/dead_ends.md)."""
+"""The squared errors of pixels that look at a layer of a cap rise by this fraction at most without it: by up to 0.5
+on tomatoes, and by 1.1 to 22 where the layer is of a real top (docs/validation/surface.md)."""
 
 
 @torch.no_grad()
@@ -61,7 +61,7 @@ def top_layer(layers: Int[np.ndarray, "n"], rise_without: Callable[[int], float]
 
     Args:
         layers: that hold matter, upwards.
-        rise_without: fraction by which the squared errors at a layer rise without it; of each layer after those above.
+        rise_without: fraction by which the squared errors at a layer rise without it, once those above are cleared.
 
     Example:
         >>> top_layer(np.arange(8), lambda layer: 0.1 if layer >= 5 else 9.0)

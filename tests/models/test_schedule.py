@@ -1,5 +1,6 @@
 """Runs by iterations and by the clock, and clocks that pause."""
 
+import numpy as np
 import pytest
 from clock_by_hand import Time, time_by_hand
 
@@ -49,6 +50,16 @@ def test_stages_and_rates_of_a_timed_run_follow_the_clock(timed, clock):
     assert coarse == fine[::4]
     assert coarse[4][2] == pytest.approx(0.5)
     assert coarse[10][2] == pytest.approx((0.5 * 0.02) ** 0.5)
+
+
+def test_the_part_of_the_last_stage_grows_from_its_start():
+    schedule, parts = Schedule(plan_stages(CONFIGS, 8)), []
+    for step in range(8):
+        schedule.begin_step(step)
+        parts.append(schedule.part_of_last_stage)
+        schedule.end_step(step)
+    assert parts[:2] == [None, None]
+    assert parts[2:] == pytest.approx(np.arange(6) / 6)
 
 
 def test_a_step_that_outlasts_a_stage_does_not_skip_the_next(timed):
