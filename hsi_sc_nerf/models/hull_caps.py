@@ -69,7 +69,7 @@ def top_layer(layers: Int[np.ndarray, "n"], rise_without: Callable[[int], float]
     """
     top = None
     for layer in map(int, layers[::-1]):
-        if rise_without(layer) > MOST_RISE:
+        if not rise_without(layer) <= MOST_RISE:  # nor where it is not a number
             break
         top = layer
     return top

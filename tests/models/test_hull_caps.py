@@ -27,6 +27,7 @@ def test_the_lowest_layer_that_pixels_do_without_may_hold_the_top(top):
 
 def test_a_top_that_pixels_ask_for_stays_whole():
     assert top_layer(np.arange(2, 15), lambda _: 5.0) is None
+    assert top_layer(np.arange(2, 15), lambda _: np.nan) is None
     assert top_layer(np.arange(0), lambda _: 0.0) is None
 
 
