@@ -265,7 +265,9 @@ def draw_poses(poses: TurntablePoses, report: dict, path: Path) -> None:
     left_out = index[~poses.used]
     if left_out.size:  # an unclipped line without points would lie in the figure's corner, and shrink all axes
         error.plot(left_out, np.zeros(len(left_out)), "x", color=COLOURS[1], label="left out", clip_on=False)
-    error.axhline(REPROJECTION_TARGET_PX, color="black", linestyle="--", label=f"target, {REPROJECTION_TARGET_PX:g} px")
+    error.axhline(
+        REPROJECTION_TARGET_PX, color="black", linestyle="--", label=f"target, {REPROJECTION_TARGET_PX:g} px"
+    )
     if np.isfinite(poses.overall_error_px):
         # Far below the target, the frames are compared with each other.
         error.set_ylim(0.0, _AXIS_OVER_LARGEST * float(np.nanmax(poses.reprojection_error_px)))
