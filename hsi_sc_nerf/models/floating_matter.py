@@ -52,9 +52,8 @@ def clear_floating_matter(model: SpectralModel, manager: SpectralDataManager, st
     for piece, cells in floating_pieces(grid.opacity.numpy(force=True), lowest_in_the_air(manager)):
         pixels = pixels_that_look_at(piece, manager, step)
         if len(pixels):
-            before, errors = grid.opacity.clone(), squared_errors(model, manager, pixels)
-            grid.clear(torch.from_numpy(cells).to(before.device))
-            rises = squared_errors(model, manager, pixels) - errors
+            before = grid.opacity.clone()
+            _, rises = clear_and_compare(model, manager, torch.from_numpy(cells).to(before.device), pixels)
             if rises.mean() > CLEARLY * rises.std(correction=0) / len(rises) ** 0.5:
                 grid.opacity.copy_(before)
             else:
@@ -115,7 +114,25 @@ def pixels_that_look_at(
     return np.concatenate(pixels)
 
 
-def squared_errors(
+def clear_and_compare(
+    model: SpectralModel,
+    manager: SpectralDataManager,
+    cells: Bool[torch.Tensor, "x y z"],
+    pixels: Int[np.ndarray, "count 3"],
+) -> tuple[Float[torch.Tensor, "count"], Float[torch.Tensor, "count"]]:
+    """Clear cells of a model's occupancy grid.
+
+    Returns:
+        The squared errors of training pixels before, and by how much they rise.
+    """
+    grid = model.occupancy
+    assert grid is not None
+    errors = _squared_errors(model, manager, pixels)
+    grid.clear(cells)
+    return errors, _squared_errors(model, manager, pixels) - errors
+
+
+def _squared_errors(
     model: SpectralModel, manager: SpectralDataManager, pixels: Int[np.ndarray, "count 3"]
 ) -> Float[torch.Tensor, "count"]:
     """Squared error of the rendered reflectance of each training pixel, mean over its measured bands."""

@@ -14,7 +14,12 @@ import torch
 from jaxtyping import Int
 
 from hsi_sc_nerf.data.datamanager import SpectralDataManager
-from hsi_sc_nerf.models.floating_matter import MIN_OPACITY, lowest_in_the_air, pixels_that_look_at, squared_errors
+from hsi_sc_nerf.models.floating_matter import (
+    MIN_OPACITY,
+    clear_and_compare,
+    lowest_in_the_air,
+    pixels_that_look_at,
+)
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 
 MOST_RISE = 0.7
@@ -36,24 +41,22 @@ def clear_cap(model: SpectralModel, manager: SpectralDataManager, step: int) -> 
     grid = model.occupancy
     assert grid is not None
     before = grid.opacity.clone()
-    matter = before.numpy(force=True) > MIN_OPACITY
+    matter, height = before > MIN_OPACITY, torch.arange(before.shape[2], device=before.device).expand_as(before)
 
     def rise_without(layer: int) -> float:
         """Of the squared errors of pixels that look at a layer, those above being cleared."""
-        grid.opacity[..., layer + 1 :] = -1.0
-        pixels = pixels_that_look_at(matter & (np.arange(matter.shape[2]) == layer), manager, step)
+        grid.clear(height > layer)
+        pixels = pixels_that_look_at((matter & (height == layer)).numpy(force=True), manager, step)
         if not len(pixels):
             return np.inf
-        errors = squared_errors(model, manager, pixels)
-        grid.opacity[..., layer] = -1.0
-        rises = squared_errors(model, manager, pixels) - errors
+        errors, rises = clear_and_compare(model, manager, height == layer, pixels)
         return float(rises.mean() / errors.mean().clamp_min(1e-12))
 
-    layers = np.flatnonzero(matter.any(axis=(0, 1)))
+    layers = np.flatnonzero(matter.numpy(force=True).any(axis=(0, 1)))
     top = top_layer(layers[layers >= lowest_in_the_air(manager)], rise_without)
     grid.opacity.copy_(before)
     if top is not None:
-        grid.opacity[..., top + 1 :] = -1.0
+        grid.clear(height > top)
 
 
 def top_layer(layers: Int[np.ndarray, "n"], rise_without: Callable[[int], float]) -> int | None:
