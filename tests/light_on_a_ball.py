@@ -64,4 +64,4 @@ def measured(ball, lamp, seed=0, noise=0.005, lamp_colour=(1.0, 1.0), distance_m
     element, irradiance = np.concatenate(element), np.concatenate(irradiance)
     shown = material[element] * irradiance * (1.0 + noise * rng.standard_normal((len(element), 1)))
     of_object, no_std = np.ones(len(element), bool), np.zeros(len(element))
-    return ElementViews(element, np.concatenate(frame), shown, of_object, no_std), irradiance, material
+    return ElementViews(element, np.concatenate(frame), shown, of_object, of_object, no_std), irradiance, material

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse
@@ -19,6 +20,9 @@ from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, image_coordinates, un
 from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene, unoccluded
 from hsi_sc_nerf.light.views import SMALLEST, ElementViews
 
+if TYPE_CHECKING:
+    from open3d.t.geometry import RaycastingScene
+
 SUPPORT_SIDES = 25
 """Triangles of the support along the disc's radius: 4 mm on a turntable, so that each belongs to one element."""
 POINTS_EACH = 4
@@ -30,6 +34,12 @@ LARGEST_INCIDENCE_DEG, LARGEST_INCIDENCE_OF_SUPPORT_DEG = 70.0, 80.0
 
 MISPLACED_PX = 0.3
 """Poses, surface and interpolation are uncertain by this fraction of a pixel."""
+EDGE_PX = 2.0
+"""Pixels this near to an edge of a level surface also cover what is beyond it: interpolation uses four pixels."""
+SAME_HEIGHT_M = 1e-4
+ROUGHNESS_M = 0.001
+"""Light falls on points by means of the normals within this radius. Facets of a trained mesh are rough by 4 to 7
+degrees and would get less light from a lamp than the surface does; kernels of an ear are larger."""
 
 Pixels = Callable[[int, Int[np.ndarray, "n"], Int[np.ndarray, "n"]], Float[np.ndarray, "n bands"]]
 """Reflectance of pixels of a frame, given by line and sample; NaN where nothing was measured."""
@@ -43,6 +53,9 @@ class Elements:
         positions: a point of each part.
         normals: outward unit normals.
         on_object: which parts belong to the object, not to its support.
+        shows_light: which parts the light is fitted to: those of the object, and of the level surface that it stands
+            on, which only the object shades. Lower parts of the support are left out: a real container has plates
+            and markers on its sides that shade them otherwise.
         occluders: the whole surface, which occludes light and reflects it.
         of_triangle: element that each triangle of the occluders belongs to.
     """
@@ -50,6 +63,7 @@ class Elements:
     positions: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
     on_object: Bool[np.ndarray, "n"]
+    shows_light: Bool[np.ndarray, "n"]
     occluders: Mesh
     of_triangle: Int[np.ndarray, "t"]
 
@@ -78,7 +92,9 @@ def spread_elements(scanned: Mesh, support: Mesh, on_object: int, on_support: in
     )
     positions = np.concatenate(points)
     is_object = np.arange(len(positions)) < on_object
-    return Elements(positions, np.concatenate(own), is_object, whole, np.concatenate(of_triangle))
+    heights = positions[:, 2]
+    shows_light = is_object | (heights > heights[~is_object].max(initial=-np.inf) - SAME_HEIGHT_M)
+    return Elements(positions, np.concatenate(own), is_object, shows_light, whole, np.concatenate(of_triangle))
 
 
 def shown_points(
@@ -92,7 +108,7 @@ def shown_points(
         lift_m: distance of the origins of lines of sight from the surface.
 
     Returns:
-        Points, outward unit normals, and the weight of each in each element as seen along its normal.
+        Points, outward unit normals without roughness, and each one's weight in each element, seen along its normal.
     """
     count, whole = len(elements.positions), elements.occluders
     scanned = Mesh(whole.vertices, whole.triangles[elements.on_object[elements.of_triangle]])
@@ -116,17 +132,35 @@ def shown_points(
     weights.eliminate_zeros()
     used = weights.sum(axis=0) > 0.0
     weights = scipy.sparse.csr_array(scipy.sparse.diags_array(1.0 / weights.sum(axis=1)) @ weights[:, used])
-    points = np.concatenate([points, elements.positions])[used]
-    return points, np.concatenate([normals, elements.normals])[used], weights
+    normals = np.concatenate([smooth_normals(scanned, points, ROUGHNESS_M, normals), elements.normals])
+    return np.concatenate([points, elements.positions])[used], normals[used], weights
 
 
-def smooth_normals(mesh: Mesh, positions: Float[np.ndarray, "n 3"], radius_m: float) -> Float[np.ndarray, "n 3"]:
-    """Outward unit normals at points of a mesh: area-weighted means over its vertices within a radius."""
+def smooth_normals(
+    mesh: Mesh,
+    positions: Float[np.ndarray, "n 3"],
+    radius_m: float,
+    own: Float[np.ndarray, "n 3"] | None = None,
+) -> Float[np.ndarray, "n 3"]:
+    """Outward unit normals at points of a mesh: area-weighted means over its vertices within a radius.
+
+    Args:
+        mesh: the surface.
+        positions: points on it.
+        radius_m: of the vertices around each point.
+        own: normals of the points' facets; the other side of a leaf is left out. All vertices by default.
+    """
     tree, vertices = cKDTree(mesh.vertices), mesh.area_weighted_normals()
     nearest = tree.query(positions)[1]
-    sums = np.empty((len(positions), 3))
+    sums = vertices[nearest]
+    if own is not None:
+        sums = np.where((sums * own).sum(axis=1, keepdims=True) > 0.0, sums, own)
     for row, near in enumerate(tree.query_ball_point(positions, radius_m)):
-        sums[row] = vertices[near].sum(axis=0) if near else vertices[nearest[row]]
+        around = vertices[near]
+        if own is not None:
+            around = around[around @ own[row] > 0.0]
+        if len(around):
+            sums[row] = around.sum(axis=0)
     return unit_vectors(sums)
 
 
@@ -223,6 +257,25 @@ def observe_elements(
         whole &= np.isfinite(np.asarray(value)).all(axis=1)
         value = np.asarray(value)[whole]
         std = MISPLACED_PX * np.hypot(across, along)[whole] / np.maximum(value.mean(axis=1), SMALLEST)
-        found.append((seen[whole], np.full(len(value), frame), value, std))
-    element, frames, reflectance, std = (np.concatenate(column) for column in zip(*found, strict=True))
-    return ElementViews(element, frames, reflectance, elements.on_object[element], std)
+        seen, shows_light = seen[whole], elements.shows_light[seen[whole]]
+        level = np.flatnonzero(shows_light & ~elements.on_object[seen])
+        shows_light[level] = _shown_alone(scene, elements.positions[seen[level]], pose, intrinsics)
+        found.append((seen, np.full(len(value), frame), value, elements.on_object[seen], shows_light, std))
+    return ElementViews(*(np.concatenate(column) for column in zip(*found, strict=True)))
+
+
+def _shown_alone(
+    scene: RaycastingScene,
+    positions: Float[np.ndarray, "n 3"],
+    camera_to_world: Float[np.ndarray, "4 4"],
+    intrinsics: PinholeIntrinsics,
+) -> Bool[np.ndarray, "n"]:
+    """Whether a frame shows points of a level surface with nothing else within `EDGE_PX`."""
+    eye, rotation = camera_to_world[:3, 3], camera_to_world[:3, :3]
+    sight = (positions - eye) @ rotation
+    beside = EDGE_PX * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    beside = np.pad(beside / [intrinsics.fl_x, intrinsics.fl_y], ((0, 0), (0, 1)))
+    along = (sight[:, None] / -sight[:, None, 2:] + beside) @ rotation.T
+    rays = np.concatenate([np.broadcast_to(eye, along.shape), along], axis=-1).astype(np.float32)
+    heights = eye[2] + scene.cast_rays(rays)["t_hit"].numpy() * along[..., 2]
+    return (np.abs(heights - positions[:, 2:]) < SAME_HEIGHT_M).all(axis=1)

@@ -41,6 +41,9 @@ front of and behind a body can hardly be distinguished from one lamp and an unev
 SIGNIFICANT_LAMP = 30.0
 """Squared standard deviations by which a lamp in one of 200 directions must exceed 0: more than errors of mesh and
 model that resemble a lamp reach (docs/validation/light.md)."""
+NEARLY = 0.9
+"""Lamps whose significance is at least this fraction of the largest are told apart by their shadows on the level
+surface: upright bodies hardly tell how high a lamp stands. Shadows alone would mislead where there are two lamps."""
 LEAST_LAMP = 0.02
 """Weaker lamps are removed."""
 UNEVENNESS, UNEVENNESS_COUNT = 0.03, 2.0
@@ -167,17 +170,18 @@ class _LightFitting(MaterialFitting):
         residual, jacobian = self.linearised()
         expected = 1.0 / self.irradiance().mean(axis=1, keepdims=True)
         residual, columns, others = self.without_materials(residual[:, None], units * expected, jacobian)
-        precision = self.precision[:, None]
+        precision = (self.precision * self.views.on_object)[:, None]
         # The part that chamber and lamps can explain is removed.
         hessian = (others * precision).T @ others + CORRELATED * self._prior()[0]
         known = np.linalg.solve(hessian, (others * precision).T @ np.hstack([residual, columns]))
         residual, *columns = (np.hstack([residual, columns]) - others @ known).T
         columns = np.stack(columns, axis=-1)
-        significance = self.errors.significance(residual, columns, self.precision)
-        best = int(significance.argmax())
+        significance = self.errors.significance(residual, columns, precision[:, 0])
+        with_shadows = self.errors.significance(residual, columns, self.precision)
+        best = int(np.where(significance >= NEARLY * significance.max(), with_shadows, -1.0).argmax())
         if significance[best] < SIGNIFICANT_LAMP:
             return False
-        weighted = columns[:, best] * self.precision
+        weighted = columns[:, best] * precision[:, 0]
         strength = (weighted @ residual) / (weighted @ columns[:, best])
         light = self.light
         self._set(

@@ -248,7 +248,7 @@ def light_on_object(
     weighted = scipy.sparse.csr_array(entries, shape=(len(elements.positions), len(views.element)))
     if fit.gloss is not None:
         matte = fit.gloss.taken_off(views.reflectance, turning.normals_in_camera(views), light)
-        views = replace(views, reflectance=np.where(views.shows_light[:, None], matte, views.reflectance))
+        views = replace(views, reflectance=np.where(views.on_object[:, None], matte, views.reflectance))
     above, below = weighted @ (views.reflectance * irradiance), weighted @ irradiance**2
     seen = below[:, 0] > 0.0
     material = np.clip(above / np.maximum(below, 1e-9), 1e-4, 1.0)

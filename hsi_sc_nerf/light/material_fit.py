@@ -25,6 +25,8 @@ from hsi_sc_nerf.robust_scatter import robust_std, tukey_weights
 OCCLUSION_ERROR = 0.1
 """Error of irradiance relative to the part that neighbours occlude: meshes are uncertain where bodies touch."""
 LEAST_IRRADIANCE = 0.02
+LEAST_WEIGHT = 1e-6
+"""Not 0, so that no element is left without a measurement."""
 STEPS = 6
 """Turns of materials, bounces and weights under a known light: none changes any longer."""
 GLOSS_STEPS, GLOSS_SETTLED = 6, 0.001
@@ -98,6 +100,8 @@ class MaterialFitting:
         occluded = 1.0 - elements.transfer.sky[views.element]
         self._own_std = np.hypot(views.own_std, OCCLUSION_ERROR * occluded)
         self._highlight_std = np.zeros(count[0])
+        light_shown = np.bincount(views.element, views.shows_light)[views.element] > 0.0
+        self._unused_weights = np.where(light_shown, LEAST_WEIGHT, 1.0)
         self.precision = np.zeros(count[0])
         self.weights, self.scatter = np.ones(count[0]), 0.0
         self.bounced = np.zeros((count[0], views.reflectance.shape[1]), np.float32)
@@ -125,19 +129,20 @@ class MaterialFitting:
 
     def take_gloss_off(self) -> bool:
         """Find what the skin mirrors under the light of now; False if that is nothing, or as much as before."""
-        used, normals = self.views.shows_light, self.elements.normals_in_camera(self.views)
+        on_object, normals = self.views.on_object, self.elements.normals_in_camera(self.views)
         before = 0.0 if self.gloss is None else self.gloss.reflectance
         irradiance = self.irradiance()
         diffuse = self.materials(irradiance)[self.views.element] * irradiance
         left = (self.views.reflectance - diffuse).mean(axis=1) - before * mirrored_chamber(normals, self.light)
-        found = find_gloss(normals[used], left[used], self.light)
+        found = find_gloss(normals[on_object], left[on_object], self.light)
         if found is None:
             return False
         self.gloss = found
         reflectance = self.views.reflectance
-        self.measured = np.where(used[:, None], found.taken_off(reflectance, normals, self.light), reflectance)
+        matte = found.taken_off(reflectance, normals, self.light)
+        self.measured = np.where(on_object[:, None], matte, reflectance)
         expected = np.maximum(diffuse.mean(axis=1), SMALLEST)
-        self._highlight_std = HIGHLIGHT_ERROR * used * found.highlight(normals) / expected
+        self._highlight_std = HIGHLIGHT_ERROR * on_object * found.highlight(normals) / expected
         return abs(found.reflectance - before) > GLOSS_SETTLED
 
     def bounce(self) -> None:
@@ -178,13 +183,13 @@ class MaterialFitting:
 
     def weigh(self, residual: Float[np.ndarray, "m"]) -> None:
         """Find the scatter and the measurements' weights."""
-        used = self.views.shows_light
-        self.scatter = float(robust_std(residual[used], least=SMALLEST_SCATTER))
+        on_object, used = self.views.on_object, self.views.shows_light
+        self.scatter = float(robust_std(residual[on_object], least=SMALLEST_SCATTER))
         own_std = np.hypot(self._own_std, self._highlight_std)
-        beyond = scatter_beyond(residual[used], own_std[used])
+        # Of the object alone: a wrong light would pass for scatter of the level surface.
+        beyond = scatter_beyond(residual[on_object], own_std[on_object])
         std = np.hypot(beyond, own_std)
-        # Never 0, so that no element is left without a measurement.
-        self.weights = np.where(used, np.maximum(tukey_weights(residual / std), 1e-6), 1.0)
+        self.weights = np.where(used, np.maximum(tukey_weights(residual / std), LEAST_WEIGHT), self._unused_weights)
         self.precision = self.weights * used / std**2
         # A highlight that is not taken off in full would brighten the material, and so be found smaller each time.
         self.weights = self.weights / (1.0 + (self._highlight_std / beyond) ** 2)

@@ -7,7 +7,7 @@ those that receive less light are darker; this also shows light that does not ch
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -29,6 +29,7 @@ from hsi_sc_nerf.light.material_fit import LightFit
 from hsi_sc_nerf.light.views import ElementViews, TurningElements
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.packed.cube import unpack
+from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.processing.view_changes import like_spectra
 from hsi_sc_nerf.surface.depth_renders import DepthRenders, render_depth_maps
 from hsi_sc_nerf.surface.outline_opacity import outline_opacity
@@ -72,8 +73,7 @@ class RunLight:
     @property
     def support_unknown(self) -> bool:
         """Whether the object stands above the disc on something of unknown size, whose shade is left out."""
-        dataset = self.run.dataset
-        return dataset.container is None and bool(dataset.object_box_m[0, 2] > STANDS_ON_DISC_M)
+        return _support_unknown(self.run.dataset)
 
     def irradiance(
         self, points_m: Float[np.ndarray, "n 3"]
@@ -134,6 +134,8 @@ def light_of_run(
     size_m = None if container is None else (container.diameter_m, container.height_m)
     support = support_mesh(size_m, float(dataset.scene_box_m[1, 0]))
     elements = spread_elements(scanned, support, ELEMENTS, SUPPORT_ELEMENTS, SMOOTHING_M)
+    if _support_unknown(dataset):  # which shades the disc as well
+        elements = replace(elements, shows_light=elements.on_object)
     poses = renders.camera_to_world.cpu().numpy().astype(float)
     poses[:, :3, 3] = run.to_metres(poses[:, :3, 3])
     centre_m = centre_in_camera(elements, poses)
@@ -147,7 +149,7 @@ def light_of_run(
         return np.where(valid, reflectance, np.nan)
 
     views = observe_elements(elements, poses, renders.intrinsics, renders.distortion, sampler.masks, pixels, LIFT_M)
-    if views.shows_light.sum() < LEAST_VIEWS:
+    if views.on_object.sum() < LEAST_VIEWS:
         raise InputError(
             "too few pixels of the object fit its surface; look at masks and poses in the dataset's report."
         )
@@ -157,6 +159,10 @@ def light_of_run(
     covariance, evidence = light.fit.covariance, shading_evidence(turning, light.views, light.spectral)
     stationary = KnownLight(light.spectral.light, covariance, centre_m, wavelengths_nm)
     return RunLight(run, light, stationary, evidence, renders, mesh)
+
+
+def _support_unknown(dataset: PackedDataset) -> bool:
+    return dataset.container is None and bool(dataset.object_box_m[0, 2] > STANDS_ON_DISC_M)
 
 
 def seen_part(mesh: SurfaceMesh, renders: DepthRenders) -> SurfaceMesh:
@@ -208,7 +214,7 @@ def shading_evidence(elements: TurningElements, views: ElementViews, fit: LightF
         views: their measurements without gloss, by the same bands as the fit.
         fit: light and materials.
     """
-    rows = np.flatnonzero(views.shows_light)
+    rows = np.flatnonzero(views.on_object)
     element, weights = views.element[rows], fit.weights[rows]
     brightness = np.log(np.maximum(views.reflectance[rows].mean(axis=1), 1e-4))
     # Brightness of a material is that of its mean over the bands.

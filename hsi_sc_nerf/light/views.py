@@ -104,14 +104,15 @@ class ElementViews:
         element: index of the element.
         frame: index of the frame.
         reflectance: as measured, relative to the white reference.
-        shows_light: whether the light is fitted to it; the others determine their element's material only. It is
-            false on markers, whose pixels cover paper and ink.
+        on_object: whether the element belongs to the object.
+        shows_light: whether the light is fitted to it; the others determine their element's material only.
         own_std: the known part of the standard deviation, relative to the reflectance.
     """
 
     element: Int[np.ndarray, "m"]
     frame: Int[np.ndarray, "m"]
     reflectance: Float[np.ndarray, "m bands"]
+    on_object: Bool[np.ndarray, "m"]
     shows_light: Bool[np.ndarray, "m"]
     own_std: Float[np.ndarray, "m"]
 

@@ -7,10 +7,12 @@ import trimesh
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.light.elements import (
+    EDGE_PX,
     MISPLACED_PX,
     Elements,
     observe_elements,
     shown_points,
+    smooth_normals,
     spread_elements,
     support_mesh,
 )
@@ -94,7 +96,12 @@ def test_pixels_do_not_show_what_lies_in_a_groove():
     x = np.linspace(0.006, 0.014, 50)
     positions = np.stack([x, np.full(50, 0.01), np.full(50, 0.004)], axis=1)
     elements = Elements(
-        positions, np.tile([0.0, 0.0, 1.0], (50, 1)), np.ones(50, bool), comb, np.zeros(len(comb.triangles), int)
+        positions,
+        np.tile([0.0, 0.0, 1.0], (50, 1)),
+        np.ones(50, bool),
+        np.ones(50, bool),
+        comb,
+        np.zeros(len(comb.triangles), int),
     )
     points, _, weights = shown_points(elements, 0.006, 1e-5)
     on_side = (points[:, 2] > 1e-4) & (points[:, 2] < 0.0039)
@@ -112,7 +119,7 @@ def test_measurements_are_uncertain_where_brightness_changes_from_pixel_to_pixel
     plane = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
     across = np.random.default_rng(0).uniform(-0.8 * half, 0.8 * half, (400, 2))
     positions, normals = np.pad(across, ((0, 0), (0, 1))), np.tile([0.0, 0.0, 1.0], (400, 1))
-    elements = Elements(positions, normals, np.ones(400, bool), plane, np.zeros(2, int))
+    elements = Elements(positions, normals, np.ones(400, bool), np.ones(400, bool), plane, np.zeros(2, int))
     pose = np.eye(4)
     pose[2, 3] = DISTANCE_M
     focal = DISTANCE_M / PIXEL_M
@@ -132,3 +139,69 @@ def test_measurements_are_uncertain_where_brightness_changes_from_pixel_to_pixel
     np.testing.assert_allclose(views.reflectance[close, 0], expected, rtol=1e-5)
     np.testing.assert_allclose(views.own_std[close], MISPLACED_PX * 0.4 / expected, rtol=1e-5)
     np.testing.assert_allclose(views.own_std[np.abs(beyond_edge) > 0.55], 0.0, atol=1e-9)
+
+
+def test_only_the_object_and_the_surface_that_it_stands_on_show_the_light():
+    """Plates and markers shade a container's side and the disc around it; they are not modelled."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS_M)
+    mesh = Mesh(np.array(ball.vertices), np.array(ball.faces)).moved(np.array([0.0, 0.0, 0.04 + RADIUS_M]))
+    elements = spread_elements(mesh, support_mesh((0.08, 0.04), 0.1), 200, 300, smoothing_m=0.003)
+    on_lid = ~elements.on_object & (elements.positions[:, 2] > 0.0399)
+    assert on_lid.sum() > 20 < (~elements.on_object & ~on_lid).sum()
+    np.testing.assert_array_equal(elements.shows_light, elements.on_object | on_lid)
+    alone = spread_elements(mesh, support_mesh(None, 0.0), 200, 0, smoothing_m=0.003)
+    assert alone.shows_light.all()
+
+
+def test_pixels_that_also_cover_what_is_beyond_a_lid_do_not_show_the_light():
+    """A lid of 8 pixels' radius, seen from above before the disc."""
+    radius_m, height_m = 8 * PIXEL_M, 0.05
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=RADIUS_M)
+    behind_camera = Mesh(np.array(ball.vertices), np.array(ball.faces)).moved(np.array([0.0, 0.0, 5.0]))
+    lid = spread_elements(behind_camera, support_mesh((2 * radius_m, height_m), 0.2), 10, 600, smoothing_m=0.003)
+    pose = np.eye(4)
+    pose[2, 3] = height_m + DISTANCE_M
+    focal = DISTANCE_M / PIXEL_M
+    views = observe_elements(
+        lid,
+        pose[None],
+        PinholeIntrinsics(SIZE, SIZE, focal, focal, SIZE / 2, SIZE / 2),
+        (0.0, 0.0, 0.0, 0.0),
+        np.zeros((1, SIZE, SIZE), bool),
+        lambda frame, line, sample: np.full((len(line), 3), 0.5),
+        1e-4,
+    )
+    assert not views.on_object.any()
+    to_edge = 8.0 - np.hypot(*lid.positions[views.element, :2].T) / PIXEL_M
+    assert views.shows_light[to_edge > 1.1 * EDGE_PX].all()
+    # Straight right, left, above and below are looked at: a diagonal edge may be nearer by a sixth.
+    assert not views.shows_light[to_edge < 0.75 * EDGE_PX].any()
+    assert not views.shows_light[lid.positions[views.element, 2] < 0.9 * height_m].any()
+
+
+def test_a_mesh_that_is_rough_by_its_voxels_is_lit_as_the_smooth_surface():
+    """Facets of a noisy ball are 9 degrees off; the normals that light falls on, a third of it."""
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=RADIUS_M)
+    rng = np.random.default_rng(0)
+    radial = np.array(ball.vertices) / RADIUS_M
+    rough = Mesh(radial * (RADIUS_M + 1e-4 * rng.standard_normal((len(radial), 1))), np.array(ball.faces))
+    elements = spread_elements(rough, support_mesh(None, 0.0), 500, 0, smoothing_m=0.003)
+    points, normals, weights = shown_points(elements, 0.003, 1e-5)
+    facets = rough.vertices[rough.triangles].mean(axis=1)
+
+    def off_deg(where: np.ndarray, found: np.ndarray) -> float:
+        cosines = (where * found).sum(axis=1) / np.linalg.norm(where, axis=1)
+        return float(np.rad2deg(np.sqrt(np.mean(np.arccos(np.clip(cosines, -1.0, 1.0)) ** 2))))
+
+    assert off_deg(facets, rough.facet_normals()) > 7.0
+    assert off_deg(points, normals) < 4.0
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0, atol=1e-9)
+
+
+def test_the_other_side_of_a_leaf_does_not_turn_its_normals():
+    """A leaf of 0.4 mm: both sides lie within the radius."""
+    leaf = trimesh.creation.box((0.03, 0.03, 0.0004)).subdivide().subdivide().subdivide().subdivide().subdivide()
+    mesh = Mesh(np.array(leaf.vertices), np.array(leaf.faces))
+    up = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    places = np.array([[0.001, 0.002, 0.0002], [0.001, 0.002, -0.0002]])
+    np.testing.assert_allclose(smooth_normals(mesh, places, 0.001, up), up, atol=1e-6)

@@ -4,10 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from light_on_a_ball import FACING, TO_LAMP, measured, turning_ball
 from scipy.optimize import lsq_linear
 
+from hsi_sc_nerf.geometry.mesh import Mesh
+from hsi_sc_nerf.light.elements import spread_elements, support_mesh
 from hsi_sc_nerf.light.fit import fit_light, newton_step
+from hsi_sc_nerf.light.material import turning_elements
+from hsi_sc_nerf.light.stationary_light import even_chamber
+from hsi_sc_nerf.light.views import ElementViews
 
 
 @pytest.fixture(scope="module")
@@ -99,3 +105,38 @@ def test_a_white_below_the_object_got_less_of_a_near_lamp():
         for place in (place_m, None)
     ]
     assert abs(errors[0]) < 0.02 < 0.05 < errors[1]
+
+
+@pytest.mark.slow
+def test_the_shadow_of_a_post_shows_how_high_a_lamp_stands():
+    """Its sides are lit alike by lamps of any height; its shadow on the lid that it stands on is not."""
+    post = trimesh.creation.cylinder(0.02, 0.1, sections=48).subdivide_to_size(0.004)
+    mesh = Mesh(np.array(post.vertices), np.array(post.faces)).moved(np.array([0.0, 0.0, 0.09]))
+    elements = spread_elements(mesh, support_mesh((0.1, 0.04), 0.06), 300, 300, smoothing_m=0.003)
+    parts = turning_elements(elements, turning_ball(2).rotations, 0.003, 1e-4)
+    light = replace(even_chamber(2), lamps=np.array([0.4]), to_lamps=TO_LAMP[None])
+    light = replace(light, chamber=light.chamber * (1.0 - 0.4 * TO_LAMP[2]))
+    rng = np.random.default_rng(0)
+    material = rng.uniform(0.2, 0.8, (len(elements.positions), 2))
+    sides = elements.on_object & (np.abs(elements.normals[:, 2]) < 0.1)
+    rows = []
+    for frame, rotation in enumerate(parts.rotations):
+        lit = parts.direct(light, frame) + parts.bounced(light, material, frame)
+        facing_camera = sides & (elements.normals @ rotation[:, 2] > 0.35)
+        seen = np.flatnonzero(facing_camera | (~elements.on_object & elements.shows_light))
+        shown = (material * lit)[seen] * (1.0 + 0.005 * rng.standard_normal((len(seen), 1)))
+        rows.append(
+            (seen, np.full(len(seen), frame), shown, sides[seen], elements.shows_light[seen], np.zeros(len(seen)))
+        )
+    views = ElementViews(*(np.concatenate(column) for column in zip(*rows, strict=True)))
+    assert (views.shows_light & ~views.on_object).any()
+
+    def errors(used):
+        found = fit_light(parts, used, FACING)
+        seen = np.unique(used.element[used.on_object])
+        off_deg = np.rad2deg(np.arccos(np.clip(found.light.to_lamps[0] @ TO_LAMP, -1.0, 1.0)))
+        return off_deg, abs(np.median((found.material / material)[seen]) - 1.0)
+
+    with_shadow, without = errors(views), errors(replace(views, shows_light=views.on_object))
+    assert with_shadow[0] < 0.5 < 1.0 < without[0]
+    assert with_shadow[1] < 0.002 < 0.005 < without[1]
