@@ -108,7 +108,8 @@ def test_a_lamp_on_a_run_is_found_and_divided_out(lit):
     assert told["relative_std"] == pytest.approx(np.median(std / by_band.mean(axis=1)), rel=1e-4)
     assert told["support_unknown"] is True
     on_disc = ~lit.light.views.on_object
-    assert on_disc.any() and not lit.light.views.shows_light[on_disc].any()  # what shades the disc is unknown
+    assert on_disc.any()
+    assert not lit.light.views.shows_light[on_disc].any()  # what shades the disc is unknown
 
 
 @pytest.mark.slow
