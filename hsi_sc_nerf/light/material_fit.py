@@ -25,8 +25,6 @@ from hsi_sc_nerf.robust_scatter import robust_std, tukey_weights
 OCCLUSION_ERROR = 0.1
 """Error of irradiance relative to the part that neighbours occlude: meshes are uncertain where bodies touch."""
 LEAST_IRRADIANCE = 0.02
-LEAST_WEIGHT = 1e-6
-"""Not 0, so that no element is left without a measurement."""
 STEPS = 6
 """Turns of materials, bounces and weights under a known light: none changes any longer."""
 GLOSS_STEPS, GLOSS_SETTLED = 6, 0.001
@@ -100,8 +98,6 @@ class MaterialFitting:
         occluded = 1.0 - elements.transfer.sky[views.element]
         self._own_std = np.hypot(views.own_std, OCCLUSION_ERROR * occluded)
         self._highlight_std = np.zeros(count[0])
-        light_shown = np.bincount(views.element, views.shows_light)[views.element] > 0.0
-        self._unused_weights = np.where(light_shown, LEAST_WEIGHT, 1.0)
         self.precision = np.zeros(count[0])
         self.weights, self.scatter = np.ones(count[0]), 0.0
         self.bounced = np.zeros((count[0], views.reflectance.shape[1]), np.float32)
@@ -183,13 +179,13 @@ class MaterialFitting:
 
     def weigh(self, residual: Float[np.ndarray, "m"]) -> None:
         """Find the scatter and the measurements' weights."""
-        on_object, used = self.views.on_object, self.views.shows_light
-        self.scatter = float(robust_std(residual[on_object], least=SMALLEST_SCATTER))
+        used = self.views.shows_light
+        self.scatter = float(robust_std(residual[self.views.on_object], least=SMALLEST_SCATTER))
         own_std = np.hypot(self._own_std, self._highlight_std)
-        # Of the object alone: a wrong light would pass for scatter of the level surface.
-        beyond = scatter_beyond(residual[on_object], own_std[on_object])
+        beyond = scatter_beyond(residual[used], own_std[used])
         std = np.hypot(beyond, own_std)
-        self.weights = np.where(used, np.maximum(tukey_weights(residual / std), LEAST_WEIGHT), self._unused_weights)
+        # Never 0, so that no element is left without a measurement.
+        self.weights = np.where(used, np.maximum(tukey_weights(residual / std), 1e-6), 1.0)
         self.precision = self.weights * used / std**2
         # A highlight that is not taken off in full would brighten the material, and so be found smaller each time.
         self.weights = self.weights / (1.0 + (self._highlight_std / beyond) ** 2)

@@ -9,6 +9,7 @@ from light_on_a_ball import FACING, TO_LAMP, measured, turning_ball
 from scipy.optimize import lsq_linear
 
 from hsi_sc_nerf.geometry.mesh import Mesh
+from hsi_sc_nerf.light import fit as fit_module
 from hsi_sc_nerf.light.elements import spread_elements, support_mesh
 from hsi_sc_nerf.light.fit import fit_light, newton_step
 from hsi_sc_nerf.light.material import turning_elements
@@ -107,9 +108,9 @@ def test_a_white_below_the_object_got_less_of_a_near_lamp():
     assert abs(errors[0]) < 0.02 < 0.05 < errors[1]
 
 
-@pytest.mark.slow
-def test_the_shadow_of_a_post_shows_how_high_a_lamp_stands():
-    """Its sides are lit alike by lamps of any height; its shadow on the lid that it stands on is not."""
+@pytest.fixture(scope="module")
+def post_on_lid():
+    """A post before a lamp, and what views show of it and of the lid that it stands on."""
     post = trimesh.creation.cylinder(0.02, 0.1, sections=48).subdivide_to_size(0.004)
     mesh = Mesh(np.array(post.vertices), np.array(post.faces)).moved(np.array([0.0, 0.0, 0.09]))
     elements = spread_elements(mesh, support_mesh((0.1, 0.04), 0.06), 300, 300, smoothing_m=0.003)
@@ -130,6 +131,13 @@ def test_the_shadow_of_a_post_shows_how_high_a_lamp_stands():
         )
     views = ElementViews(*(np.concatenate(column) for column in zip(*rows, strict=True)))
     assert (views.shows_light & ~views.on_object).any()
+    return parts, views, material
+
+
+@pytest.mark.slow
+def test_the_shadow_of_a_post_shows_how_high_a_lamp_stands(post_on_lid):
+    """Its sides are lit alike by lamps of any height; its shadow on the lid is not."""
+    parts, views, material = post_on_lid
 
     def errors(used):
         found = fit_light(parts, used, FACING)
@@ -140,3 +148,15 @@ def test_the_shadow_of_a_post_shows_how_high_a_lamp_stands():
     with_shadow, without = errors(views), errors(replace(views, shows_light=views.on_object))
     assert with_shadow[0] < 0.5 < 1.0 < without[0]
     assert with_shadow[1] < 0.002 < 0.005 < without[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("shadow", "least_deg", "most_deg"), [(True, 0.0, 10.0), (False, 15.0, 180.0)])
+def test_a_lamp_is_searched_for_where_its_shadow_lies(post_on_lid, monkeypatch, shadow, least_deg, most_deg):
+    """Candidates are 14 degrees apart; the fit may not find back from a distant one."""
+    parts, views, _ = post_on_lid
+    monkeypatch.setattr(fit_module, "STEPS", 1)
+    monkeypatch.setattr(fit_module, "LARGEST_TURN_RAD", 0.0)
+    used = views if shadow else replace(views, shows_light=views.on_object)
+    to_lamp = fit_light(parts, used, FACING).light.to_lamps[0]
+    assert least_deg < np.rad2deg(np.arccos(to_lamp @ TO_LAMP)) < most_deg
