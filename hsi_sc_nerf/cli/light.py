@@ -54,7 +54,7 @@ class MaterialCommand:
     """File NAME-material.json of another object, whose light is taken instead of being found on this one. The object
     must have stood in the same chamber, before the same camera and with the same white reference; best is a round,
     matte body without gloss, captured once for each chamber. An object with upright sides alone, such as an ear of
-    maize, does not show how high a lamp stands."""
+    maize, shows how high a lamp stands only by its shadow on what it stands on."""
     white_azimuth_deg: float = between(-90.0, 90.0, default=0.0)
     """Direction that the white reference faced, degrees: 0 faces the camera; positive turns towards the right edge of
     the camera's picture, negative towards the left. Not used with --light, whose session had its own."""

@@ -5,6 +5,8 @@ because the element turns under stationary light; its material does not change. 
 materials eliminated (variable projection, Golub and Pereyra 1973), with Tukey's weights against gloss and weights
 from the scatter between parts of the surface (`SharedErrors`). Lamps are added one by one while they are significant.
 
+The object's shadow on the level surface that it stands on belongs to the measurements.
+
 Light that does not change with the turn cannot be seen in the views. Prior knowledge determines it: a nearly even
 chamber, few lamps, and irradiance 1 on the white reference.
 """

@@ -1,7 +1,8 @@
 """Light that was found on one object and serves others: chamber and lamps stand still with the camera.
 
-A round body shows the light from all sides. A body whose sides are all upright does not show how high a lamp stands;
-it can take the light of the round one, captured in the same chamber with the same camera and white reference.
+A round body shows the light from all sides. A body whose sides are all upright shows how high a lamp stands only by
+its shadow. It can take the light of the round one, captured in the same chamber with the same camera and white
+reference.
 """
 
 from __future__ import annotations
