@@ -163,9 +163,8 @@ def marker_frames(scene: Scene) -> tuple[dict[int, MarkerFrame], dict[int, Marke
     markers, container = scene.markers, scene.container
     paper = markers.side_m * paper_side_in_markers(markers)
     apothem = container.diameter_m / 2.0 + PLAQUE_STANDOFF_M
-    if paper > container.height_m or (
-        markers.on_container > 2 and paper > 2.0 * apothem * np.tan(np.pi / markers.on_container)
-    ):
+    too_high = markers.on_container > 0 and paper > container.height_m
+    if too_high or (markers.on_container > 2 and paper > 2.0 * apothem * np.tan(np.pi / markers.on_container)):
         raise InputError(
             f"{markers.on_container} markers of {markers.side_m:g} m do not fit around the container; "
             "make markers.side_m or markers.on_container smaller."

@@ -171,6 +171,11 @@ def test_markers_that_cannot_be_made_are_refused(old, new, sentence):
         marker_layout(scene)
 
 
+def test_a_container_without_markers_may_be_low():
+    low = GOOD.replace("side_m: 0.036", "side_m: 0.036, on_container: 0") + "container: {height_m: 0.005}\n"
+    assert sorted(marker_layout(parse(low))) == list(range(8))
+
+
 def test_layout_is_square_planar_distinct_and_faces_outwards():
     scene = load_scene("pear")
     layout = marker_layout(scene)
