@@ -17,15 +17,19 @@ from hsi_sc_nerf.light.elements import (
     support_mesh,
 )
 from hsi_sc_nerf.light.stationary_light import even_directions
-from hsi_sc_nerf.light.views import Transfer, transfer
+from hsi_sc_nerf.light.views import ElementViews, Transfer, transfer
 
 RADIUS_M = 0.03
 DIRECTIONS = even_directions(1024)
 
 
+def ball_at(height_m: float, subdivisions: int) -> Mesh:
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=RADIUS_M)
+    return Mesh(np.array(ball.vertices), np.array(ball.faces)).moved(np.array([0.0, 0.0, height_m]))
+
+
 def ball_over(disc_radius_m: float, height_m: float = 0.0) -> tuple[Elements, Transfer]:
-    ball = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS_M)
-    mesh = Mesh(np.array(ball.vertices), np.array(ball.faces)).moved(np.array([0.0, 0.0, height_m]))
+    mesh = ball_at(height_m, subdivisions=4)
     support = support_mesh(None, disc_radius_m)
     elements = spread_elements(mesh, support, 300, 200 if disc_radius_m else 0, smoothing_m=0.003)
     rays = elements.occluders, elements.of_triangle, len(elements.positions), DIRECTIONS
@@ -113,6 +117,22 @@ EDGE = 20
 """The first bright sample."""
 
 
+def seen_from_above(elements: Elements, height_m: float, reflectance, *, of_object: bool) -> ElementViews:
+    """What a camera measures that looks down from `DISTANCE_M` above a height: reflectance by sample."""
+    pose = np.eye(4)
+    pose[2, 3] = height_m + DISTANCE_M
+    focal = DISTANCE_M / PIXEL_M
+    return observe_elements(
+        elements,
+        pose[None],
+        PinholeIntrinsics(SIZE, SIZE, focal, focal, SIZE / 2, SIZE / 2),
+        (0.0, 0.0, 0.0, 0.0),
+        np.full((1, SIZE, SIZE), of_object),
+        lambda frame, line, sample: reflectance(sample)[:, None] * np.ones(3),
+        1e-4,
+    )
+
+
 def test_measurements_are_uncertain_where_brightness_changes_from_pixel_to_pixel():
     half = SIZE / 2 * PIXEL_M
     corners = half * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
@@ -120,18 +140,7 @@ def test_measurements_are_uncertain_where_brightness_changes_from_pixel_to_pixel
     across = np.random.default_rng(0).uniform(-0.8 * half, 0.8 * half, (400, 2))
     positions, normals = np.pad(across, ((0, 0), (0, 1))), np.tile([0.0, 0.0, 1.0], (400, 1))
     elements = Elements(positions, normals, np.ones(400, bool), np.ones(400, bool), plane, np.zeros(2, int))
-    pose = np.eye(4)
-    pose[2, 3] = DISTANCE_M
-    focal = DISTANCE_M / PIXEL_M
-    views = observe_elements(
-        elements,
-        pose[None],
-        PinholeIntrinsics(SIZE, SIZE, focal, focal, SIZE / 2, SIZE / 2),
-        (0.0, 0.0, 0.0, 0.0),
-        np.ones((1, SIZE, SIZE), bool),
-        lambda frame, line, sample: np.where(sample >= EDGE, 0.6, 0.2)[:, None] * np.ones(3),
-        1e-4,
-    )
+    views = seen_from_above(elements, 0.0, lambda sample: np.where(sample >= EDGE, 0.6, 0.2), of_object=True)
     beyond_edge = positions[views.element, 0] / PIXEL_M + SIZE / 2 - EDGE
     close = np.abs(beyond_edge) < 0.45
     assert close.any()
@@ -143,8 +152,7 @@ def test_measurements_are_uncertain_where_brightness_changes_from_pixel_to_pixel
 
 def test_only_the_object_and_the_surface_that_it_stands_on_show_the_light():
     """Plates and markers shade a container's side and the disc around it; they are not modelled."""
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS_M)
-    mesh = Mesh(np.array(ball.vertices), np.array(ball.faces)).moved(np.array([0.0, 0.0, 0.04 + RADIUS_M]))
+    mesh = ball_at(0.04 + RADIUS_M, subdivisions=3)
     elements = spread_elements(mesh, support_mesh((0.08, 0.04), 0.1), 200, 300, smoothing_m=0.003)
     on_lid = ~elements.on_object & (elements.positions[:, 2] > 0.0399)
     assert on_lid.sum() > 20 < (~elements.on_object & ~on_lid).sum()
@@ -156,21 +164,9 @@ def test_only_the_object_and_the_surface_that_it_stands_on_show_the_light():
 def test_pixels_that_also_cover_what_is_beyond_a_lid_do_not_show_the_light():
     """A lid of 8 pixels' radius, seen from above before the disc."""
     radius_m, height_m = 8 * PIXEL_M, 0.05
-    ball = trimesh.creation.icosphere(subdivisions=2, radius=RADIUS_M)
-    behind_camera = Mesh(np.array(ball.vertices), np.array(ball.faces)).moved(np.array([0.0, 0.0, 5.0]))
+    behind_camera = ball_at(5.0, subdivisions=2)
     lid = spread_elements(behind_camera, support_mesh((2 * radius_m, height_m), 0.2), 10, 600, smoothing_m=0.003)
-    pose = np.eye(4)
-    pose[2, 3] = height_m + DISTANCE_M
-    focal = DISTANCE_M / PIXEL_M
-    views = observe_elements(
-        lid,
-        pose[None],
-        PinholeIntrinsics(SIZE, SIZE, focal, focal, SIZE / 2, SIZE / 2),
-        (0.0, 0.0, 0.0, 0.0),
-        np.zeros((1, SIZE, SIZE), bool),
-        lambda frame, line, sample: np.full((len(line), 3), 0.5),
-        1e-4,
-    )
+    views = seen_from_above(lid, height_m, lambda sample: np.full(len(sample), 0.5), of_object=False)
     assert not views.on_object.any()
     to_edge = 8.0 - np.hypot(*lid.positions[views.element, :2].T) / PIXEL_M
     assert views.shows_light[to_edge > 1.1 * EDGE_PX].all()
@@ -181,10 +177,10 @@ def test_pixels_that_also_cover_what_is_beyond_a_lid_do_not_show_the_light():
 
 def test_a_mesh_that_is_rough_by_its_voxels_is_lit_as_the_smooth_surface():
     """Facets of a noisy ball are 9 degrees off; the normals that light falls on, a third of it."""
-    ball = trimesh.creation.icosphere(subdivisions=5, radius=RADIUS_M)
+    ball = ball_at(0.0, subdivisions=5)
     rng = np.random.default_rng(0)
-    radial = np.array(ball.vertices) / RADIUS_M
-    rough = Mesh(radial * (RADIUS_M + 1e-4 * rng.standard_normal((len(radial), 1))), np.array(ball.faces))
+    radial = ball.vertices / RADIUS_M
+    rough = Mesh(radial * (RADIUS_M + 1e-4 * rng.standard_normal((len(radial), 1))), ball.triangles)
     elements = spread_elements(rough, support_mesh(None, 0.0), 500, 0, smoothing_m=0.003)
     points, normals, weights = shown_points(elements, 0.003, 1e-5)
     facets = rough.vertices[rough.triangles].mean(axis=1)
