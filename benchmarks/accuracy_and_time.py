@@ -62,8 +62,8 @@ STEPS_A_TURN = 10
 SETTLING_TURNS = 12
 """Turns that are not timed: by then the occupancy grid has emptied most of the hull."""
 TIMED_TURNS = 8
-DEFAULT_TURNS = 4
-"""Rows after which it is the default's turn again: all ratios are to its step, so it is timed more often."""
+REFERENCE_TURNS = 4
+"""Runs after which it is the first one's turn again: all ratios are to its step, so it is timed more often."""
 TIMED_RUN = 10_000
 """Steps of the run that the timed turns are a part of."""
 _RAYS = "--pipeline.datamanager.train-num-rays-per-batch"
@@ -249,7 +249,7 @@ def step_seconds(runs: Mapping[str, tuple[Path, str]], common: str) -> dict[str,
     """Processor seconds of a step of each run: in turns, so that other work on the machine meets all alike.
 
     Args:
-        runs: dataset and words of each, by name.
+        runs: dataset and words of each, by name. The first is timed more often: ratios are to its step.
         common: words of all.
     """
     torch.set_num_threads(1)
@@ -262,9 +262,9 @@ def step_seconds(runs: Mapping[str, tuple[Path, str]], common: str) -> dict[str,
             trainers[name] = build_trainer(job)
             trainers[name]._show_progress = lambda step, psnr_db: None
         seconds, steps = dict.fromkeys(trainers, 0.0), dict.fromkeys(trainers, 0)
-        others = [name for name in trainers if name != DEFAULT]
-        blocks = [others[start : start + DEFAULT_TURNS] for start in range(0, len(others), DEFAULT_TURNS)]
-        order = [name for block in blocks or [[]] for name in (DEFAULT, *block)]
+        reference, *others = trainers
+        blocks = [others[start : start + REFERENCE_TURNS] for start in range(0, len(others), REFERENCE_TURNS)]
+        order = [name for block in blocks or [[]] for name in (reference, *block)]
         for turn in range(SETTLING_TURNS + TIMED_TURNS):
             for name in order:
                 trainer = trainers[name]
