@@ -61,7 +61,6 @@ CASES = (
     Case("lamp, 40 % of the light", ("lamp",), ("view_dependence", "uneven_light")),
     Case("wooden boards", ("textured_background",), ("still_chamber",)),
     Case("poses wrong by 0.6 degrees", (), ("pose_refinement",), pose_error_deg=0.6),
-    Case("poses wrong by 2 degrees", (), ("pose_refinement",), pose_error_deg=2.0),
     Case("lamp, 3 %", ("{lamp: {fraction: 0.03}}",), weak=("view_dependence", "uneven_light")),
     Case("lamp, 0.3 %", ("{lamp: {fraction: 0.003}}",)),
     Case("lamp and gloss", ("lamp", "gloss"), ("view_dependence", "uneven_light")),
@@ -94,7 +93,6 @@ TRAINED = {
     "lamp, 40 % of the light": ("view_dependence",),
     "wooden boards": ("still_chamber",),
     "poses wrong by 0.6 degrees": ("pose_refinement",),
-    "poses wrong by 2 degrees": ("pose_refinement",),
     "gloss in an even chamber": ("view_dependence",),
 }
 """Cases that models are trained on, and effects that are left out in turn, or added where they are not chosen."""
