@@ -98,19 +98,25 @@ class Calibration:
     classes: tuple[str, ...] = ()
 
     def predictions(
-        self, spectra: Float[np.ndarray, "n bands"], only_inside: bool = False
+        self, spectra: Float[np.ndarray, "n others"], nm: Float[np.ndarray, "others"], only_inside: bool = False
     ) -> Float[np.ndarray, "n outputs"]:
-        """What the model says of spectra at its wavelengths: one number, or the probability of each class.
+        """What the model says of spectra, interpolated linearly to its wavelengths: one number, or the probability of
+        each class.
 
         NaN where it says nothing.
 
         Args:
             spectra: reflectance.
+            nm: their wavelengths.
             only_inside: nothing outside the domain either.
+
+        Raises:
+            InputError: its own wavelengths reach beyond.
         """
+        resampled = spectra.astype(float) @ self.interpolation(nm)
         found = np.full((len(spectra), max(1, len(self.classes))), np.nan)
         for start in range(0, len(spectra), _CHUNK_SPECTRA):
-            chunk = preprocessed(spectra[start : start + _CHUNK_SPECTRA], self.steps, self.used, self.reference)
+            chunk = preprocessed(resampled[start : start + _CHUNK_SPECTRA], self.steps, self.used, self.reference)
             known = np.isfinite(chunk).all(axis=1)
             if only_inside and self.domain is not None:
                 known[known] = self.domain.holds(chunk[known])
@@ -118,26 +124,12 @@ class Calibration:
                 found[start + np.flatnonzero(known)] = self.predict(chunk[known])
         return found
 
-    def values(self, spectra: Float[np.ndarray, "n bands"], only_inside: bool = False) -> Float[np.ndarray, "n"]:
-        """Predictions of a regression, numbers of the most probable classes of a classifier (`predictions`)."""
-        found = self.predictions(spectra, only_inside)
-        return np.where(np.isnan(found[:, 0]), np.nan, found.argmax(axis=1)) if self.classes else found[:, 0]
-
     def of(
         self, spectra: Float[np.ndarray, "n others"], nm: Float[np.ndarray, "others"], only_inside: bool = False
     ) -> Float[np.ndarray, "n"]:
-        """`values` of spectra at wavelengths ``nm``, interpolated linearly to its own."""
-        return self.values(self.resampled(spectra, nm), only_inside)
-
-    def resampled(
-        self, spectra: Float[np.ndarray, "n others"], nm: Float[np.ndarray, "others"]
-    ) -> Float[np.ndarray, "n bands"]:
-        """Spectra at wavelengths ``nm``, interpolated linearly to its own.
-
-        Raises:
-            InputError: its own reach beyond.
-        """
-        return spectra.astype(float) @ self.interpolation(nm)
+        """Predictions of a regression, numbers of the most probable classes of a classifier (`predictions`)."""
+        found = self.predictions(spectra, nm, only_inside)
+        return np.where(np.isnan(found[:, 0]), np.nan, found.argmax(axis=1)) if self.classes else found[:, 0]
 
     def interpolation(self, nm: Float[np.ndarray, "others"]) -> Float[np.ndarray, "others bands"]:
         """The matrix that interpolates spectra at wavelengths ``nm`` to its own.

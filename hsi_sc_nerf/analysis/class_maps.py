@@ -76,19 +76,19 @@ def class_map(surface: SpectralMesh, classifier: Calibration) -> ClassMap:
     seen, nm = surface.seen, surface.wavelengths_nm
     spectra = surface.spectra[seen].astype(float)
     probabilities = np.full((len(seen), len(classifier.classes)), np.nan)
-    probabilities[seen] = classifier.predictions(classifier.resampled(spectra, nm), only_inside=True)
+    probabilities[seen] = classifier.predictions(spectra, nm, only_inside=True)
     shaken = None
     if surface.scatter is not None:
         scatter = surface.scatter if surface.lit is None else surface.scatter / surface.lit.irradiance
         noise = np.nan_to_num(scatter[seen])[:, None] * np.random.default_rng(0).standard_normal(spectra.shape)
         shaken = np.full(len(seen), UNCLASSIFIED)
-        shaken[seen] = most_probable(classifier.predictions(classifier.resampled(spectra + noise, nm)))
+        shaken[seen] = most_probable(classifier.predictions(spectra + noise, nm))
         shaken[np.isnan(probabilities[:, 0])] = UNCLASSIFIED
     limited = classifier.domain is not None
     found = ClassMap(classifier.name, classifier.classes, probabilities, shaken, limited=limited)
     known, changed = found.labels[seen] != UNCLASSIFIED, 0.0
     if (coarse := classifier.coarser(nm)) is not None and known.any():
-        other = most_probable(classifier.predictions(classifier.resampled(spectra[:, coarse], nm[coarse])))
+        other = most_probable(classifier.predictions(spectra[:, coarse], nm[coarse]))
         weights = surface.areas_m2[seen][known]
         changed = float(weights @ (other != found.labels[seen])[known] / weights.sum()) / 3.0
     return replace(found, resampling_error=changed)

@@ -168,7 +168,7 @@ def cloud_payload(
     areas_m2 = point_areas_m2(cloud.points)
     lengths = np.maximum(np.linalg.norm(cloud.normals, axis=1, keepdims=True), 1e-12)
     nm, (analysed, of_what) = cloud.wavelengths_nm, _analysed(cloud)
-    calibrated = [(one, one.predictions(one.resampled(analysed, nm), only_inside=True)) for one in calibrations]
+    calibrated = [(one, one.predictions(analysed, nm, only_inside=True)) for one in calibrations]
     scalars = [
         _scalar(name, tells, values, drawn) | {"index": True, "unit": unit}
         for name, tells, values, drawn, unit in _measures(analysed, nm, of_what, indices, calibrated)

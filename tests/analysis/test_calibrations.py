@@ -82,7 +82,7 @@ def surface_of(spectra, nm=NM):
 def test_predictions_are_those_of_scikit_learn(pls, fitted):
     calibration = read_calibration(fitted)
     spectra, _ = simulated(100, seed=1)
-    found = calibration.values(spectra)
+    found = calibration.of(spectra, NM)
     np.testing.assert_allclose(found, pls.predict(pretreated(spectra)).ravel(), rtol=1e-9)
     assert (calibration.name, calibration.unit, calibration.error) == ("sugar content", "°Brix", 0.3)
 
@@ -91,9 +91,9 @@ def test_spectra_that_the_calibration_does_not_know_have_no_value(fitted):
     calibration = read_calibration(fitted)
     inside, outside = simulated(100, seed=0)[0], simulated(20, seed=1)[0]
     outside += 0.1 * np.exp(-(((NM - 500) / 10) ** 2))
-    assert np.isfinite(calibration.values(inside, only_inside=True)).mean() > 0.9
-    assert np.isnan(calibration.values(outside, only_inside=True)).all()
-    assert np.isfinite(calibration.values(outside)).all()
+    assert np.isfinite(calibration.of(inside, NM, only_inside=True)).mean() > 0.9
+    assert np.isnan(calibration.of(outside, NM, only_inside=True)).all()
+    assert np.isfinite(calibration.of(outside, NM)).all()
 
 
 @pytest.mark.parametrize("scaled", [False, True])
@@ -106,11 +106,12 @@ def test_the_code_of_the_page_writes_limits_that_hold_its_own_spectra(tmp_path, 
     names: dict = {}
     exec(code, names)
     calibration = read_calibration(tmp_path / "sugar.csv")
-    found = calibration.values(names["spectra"], only_inside=True)
+    spectra, nm = names["spectra"], names["nm"]
+    found = calibration.of(spectra, nm, only_inside=True)
     assert 0.95 < np.isfinite(found).mean() < 1.0
-    np.testing.assert_allclose(calibration.values(names["spectra"]), names["pls"].predict(names["spectra"]).ravel())
-    strange = names["spectra"].mean(axis=0) + 0.03 * np.sin(names["nm"] / 20.0)
-    assert np.isnan(calibration.values(strange[None], only_inside=True)).all()
+    np.testing.assert_allclose(calibration.of(spectra, nm), names["pls"].predict(spectra).ravel())
+    strange = spectra.mean(axis=0) + 0.03 * np.sin(nm / 20.0)
+    assert np.isnan(calibration.of(strange[None], nm, only_inside=True)).all()
 
 
 def test_each_limit_counts_alone(fitted):
@@ -120,7 +121,7 @@ def test_each_limit_counts_alone(fitted):
         lines = [f"# {key}: 1e-9" if line.startswith(f"# {key}") else line for line in text.splitlines()]
         other = {"t2_limit": "q_limit", "q_limit": "t2_limit"}[key]
         fitted.write_text("\n".join(line for line in lines if not line.startswith(f"# {other}")))
-        assert np.isnan(read_calibration(fitted).values(extreme, only_inside=True)).all()
+        assert np.isnan(read_calibration(fitted).of(extreme, NM, only_inside=True)).all()
 
 
 def test_the_table_says_where_no_limits_are_stated(fitted):
@@ -152,7 +153,7 @@ def test_a_map_of_the_same_bands_is_not_resampled(fitted):
     calibration = read_calibration(fitted)
     found = calibration_map(surface_of(spectra, NM + 0.004), calibration)
     assert found.resampling_error == 0.0
-    np.testing.assert_allclose(found.values[:50], calibration.values(spectra, only_inside=True))
+    np.testing.assert_allclose(found.values[:50], calibration.of(spectra, NM, only_inside=True))
     assert found.column == "calibration_sugar_content"
 
 
@@ -191,7 +192,7 @@ def test_models_of_scikit_learn_as_onnx(tmp_path, capfd, model, column, rtol):
     (tmp_path / model).write_bytes((MODELS / model).read_bytes())
     head = {"model": model, "column": column - 6}
     calibration = read_calibration(table(tmp_path / "own.csv", head, {"wavelength_nm": NM[:6]}))
-    np.testing.assert_allclose(calibration.values(expected[:, :6]), expected[:, column], rtol=rtol)
+    np.testing.assert_allclose(calibration.of(expected[:, :6], NM[:6]), expected[:, column], rtol=rtol)
     assert calibration.name == "own"
     with pytest.raises(InputError, match=r"no ONNX model .* 7 bands"):
         read_calibration(table(tmp_path / "own.csv", head, {"wavelength_nm": NM[:7]}))

@@ -119,7 +119,7 @@ def test_resampling_states_which_area_changes_its_class():
         lambda spectra: np.eye(2)[(spectra.mean(axis=1) > 0.42).astype(int)], classes=("flat", "peak"),
     )  # fmt: skip
     found = class_map(surface_of(narrow, dense), one)
-    other = one.values(one.resampled(narrow[:, ::2], dense[::2]))
+    other = one.of(narrow[:, ::2], dense[::2])
     changed = other != found.labels
     areas_m2 = surface_of(narrow, dense).areas_m2
     assert changed.any()
@@ -149,8 +149,8 @@ def test_an_onnx_classifier_on_the_page_in_the_tables_and_in_the_mesh(tmp_path):
     table.write_text(head + "".join(f"{nm}\n" for nm in NM))
     one = read_calibration(table)
     expected = np.loadtxt(MODELS / "expected.csv", delimiter=",")
-    np.testing.assert_allclose(one.predictions(expected[:, :6])[:, 1], expected[:, 7], rtol=1e-5)
-    np.testing.assert_array_equal(one.values(expected[:, :6]), expected[:, 7] > 0.5)
+    np.testing.assert_allclose(one.predictions(expected[:, :6], NM)[:, 1], expected[:, 7], rtol=1e-5)
+    np.testing.assert_array_equal(one.of(expected[:, :6], NM), expected[:, 7] > 0.5)
 
     surface = surface_of(np.resize(expected[:, :6], (len(MESH.vertices), 6)))
     found = class_map(surface, one)
