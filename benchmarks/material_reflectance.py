@@ -70,8 +70,10 @@ COLUMNS = (
     "worst of material, %",
     "irradiance, true to found, 5 to 95 %",
     "stated std, median, %",
-    "within 1 std, %",
-    "within 2 std, %",
+    "irradiance within 1 std, %",
+    "irradiance within 2 std, %",
+    "material within 1 std, %",
+    "material within 2 std, %",
     "CPU seconds",
 )
 ELEMENTS, SUPPORT_ELEMENTS = 2000, 800
@@ -148,6 +150,7 @@ class Judged:
         spots, as_measured = (spot_errors(self.points, spectra, self.true) for spectra in (corrected, self.measured))
         light, relative = self.true_irradiance / found.mean(axis=1), std / found.mean(axis=1)
         sigmas = (np.abs(light - 1.0) / relative)[np.isfinite(light)]
+        of_material = np.abs(bright - 1.0) / relative
         span = "{:.3f} to {:.3f}"
         return [
             "yes" if evidence.shaded else "no",
@@ -165,6 +168,8 @@ class Judged:
             f"{100.0 * np.median(relative):.1f}",
             f"{100.0 * (sigmas < 1.0).mean():.0f}",
             f"{100.0 * (sigmas < 2.0).mean():.0f}",
+            f"{100.0 * (of_material < 1.0).mean():.0f}",
+            f"{100.0 * (of_material < 2.0).mean():.0f}",
             f"{self.seconds:.0f}",
         ]
 

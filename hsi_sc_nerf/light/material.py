@@ -26,6 +26,9 @@ LEAST_SIDEWAYS = 0.1
 """Square of the sine between the optical axis and the turntable's: 18 degrees."""
 UNEXPLAINED = 2.0
 """Error of irradiance relative to the scatter: the model's errors in single views do not average out."""
+CONTACT_ERROR, CONTACT_M = 0.5, 0.0025
+"""Relative error of the material at the level surface that the object stands on, and the height over which it falls
+by the factor e: pixels also show that surface, and a trained mesh fills the crevice (docs/validation/light.md)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +77,8 @@ class ObjectLight:
             frames: the frame that measured each point.
 
         Returns:
-            The irradiance, and the standard deviation of its mean over the bands.
+            The irradiance, and the standard deviation of its mean over the bands, which for a point just above the
+            surface that the object stands on is that of the material times the irradiance.
         """
         of_object = np.flatnonzero(self.elements.on_object)
         right_angle_m = NORMAL_WEIGHT * self._spacing_m / np.sqrt(2.0)
@@ -94,6 +98,10 @@ class ObjectLight:
             result[rows] = np.einsum("nk,nkb->nb", weights[rows], whole[nearest[rows]])
         result = np.maximum(result, LEAST_IRRADIANCE)
         relative = np.sqrt((weights * self._relative_variance[nearest]).sum(axis=1))
+        level = self.elements.shows_light & ~self.elements.on_object
+        if level.any():
+            above_m = np.maximum(points_m[:, 2] - self.elements.positions[level, 2].mean(), 0.0)
+            relative = np.hypot(relative, CONTACT_ERROR * np.exp(-above_m / CONTACT_M))
         return result, relative * result.mean(axis=1)
 
     def mirrored(

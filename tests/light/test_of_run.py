@@ -23,6 +23,7 @@ from hsi_sc_nerf.geometry.camera import pixel_rays
 from hsi_sc_nerf.light.fit import fit_light
 from hsi_sc_nerf.light.gloss import HALF, Gloss
 from hsi_sc_nerf.light.known_light import read_light
+from hsi_sc_nerf.light.material import CONTACT_ERROR, CONTACT_M
 from hsi_sc_nerf.light.of_run import RunLight, light_of_run, shading_evidence
 from hsi_sc_nerf.models.trained_run import open_trained_run
 from hsi_sc_nerf.packed.cube import pack, write_packed_cube
@@ -110,6 +111,21 @@ def test_a_lamp_on_a_run_is_found_and_divided_out(lit):
     on_disc = ~lit.light.views.on_object
     assert on_disc.any()
     assert not lit.light.views.shows_light[on_disc].any()  # what shades the disc is unknown
+
+
+@pytest.mark.slow
+def test_points_just_above_the_surface_that_an_object_stands_on_are_uncertain(lit):
+    elements, above_m = lit.light.elements, np.array([-0.001, 0.0, CONTACT_M, 10.0 * CONTACT_M])
+    on_disc = replace(lit.light, elements=replace(elements, shows_light=np.ones_like(elements.shows_light)))
+    points = np.stack([np.full(4, 0.01), np.zeros(4), above_m], axis=1)
+    normals, frames = np.broadcast_to([1.0, 0.0, 0.0], (4, 3)), np.zeros(4, int)
+    (irradiance, std), (same, unknown_support) = (
+        light.irradiance(points, normals, frames) for light in (on_disc, lit.light)
+    )
+    np.testing.assert_array_equal(irradiance, same)
+    added = np.sqrt(std**2 - unknown_support**2) / irradiance.mean(axis=1)
+    expected = CONTACT_ERROR * np.array([1.0, 1.0, np.exp(-1.0), np.exp(-10.0)])
+    np.testing.assert_allclose(added, expected, rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.slow
