@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -40,6 +39,7 @@ _SPECIAL = {
     "quality": columns.QUALITY,
     "flags": columns.FLAGS,
     "volume": columns.SIZE["volume_l"][0],
+    "piece": columns.PIECE,
 }
 
 
@@ -92,7 +92,7 @@ def thumbnail(data: Path) -> str:
 
 
 def _key_figures(table: BatchTable) -> dict[str, str]:
-    statuses, seconds = _values(table, columns.STATUS), _values(table, columns.TOTAL)
+    statuses, seconds = (table.values(table.columns[table.places[of]]) for of in (columns.STATUS, columns.TOTAL))
     figures = {state: str(statuses.count(state)) for state in ("done", "failed", "damaged", "unfinished")}
     figures = {state: count for state, count in figures.items() if count != "0" or state in ("done", "failed")}
     known = [value for value in seconds if isinstance(value, float)]
@@ -102,24 +102,9 @@ def _key_figures(table: BatchTable) -> dict[str, str]:
     return figures
 
 
-def _values(table: BatchTable, standing: Column) -> list[columns.Value]:
-    return table.values(table.columns[_place(table, standing)])
-
-
-def _place(table: BatchTable, standing: Column) -> int:
-    """Where a standing column is, whatever name it had to take."""
-    return next(
-        at for at, column in enumerate(table.columns) if column.group != "list" and _bare(column) == _bare(standing)
-    )
-
-
-def _bare(column: Column) -> Column:
-    return replace(column, name="", spread=None)
-
-
 def _payload(table: BatchTable, out: Path, done: Callable[[int], None] | None) -> dict[str, Any]:
     """What the scripts need: columns, rows, and of each row the picture and the address of its report."""
-    shown = {_bare(column) for column in _SHOWN}
+    shown = {table.places[column] for column in _SHOWN}
     described = [
         {
             "label": _label(column),
@@ -128,16 +113,15 @@ def _payload(table: BatchTable, out: Path, done: Callable[[int], None] | None) -
             "group": column.group,
             "kind": column.kind,
             "spread": table.columns.index(column.spread) if column.spread else None,
-            "shown": _bare(column) in shown
+            "shown": number in shown
             or (column.group == "index" and column.spread is not None)
             or (column.group == "class" and column.name.endswith("_fraction") and "_mixture_" not in column.name)
             or (column.group == "list" and column.name not in _HIDDEN_OF_LIST),
         }
-        for column in table.columns
+        for number, column in enumerate(table.columns)
     ]
     names = [column.name for column in table.columns]
     object_at = names.index(OBJECT)
-    has_pieces = any(_bare(column) == _bare(columns.PIECE) for column in table.columns)
     pictures = []
     for number, row in enumerate(table.rows, start=1):
         pictures.append(thumbnail(out / OBJECTS_NAME / str(row[object_at]) / "data"))
@@ -149,8 +133,7 @@ def _payload(table: BatchTable, out: Path, done: Callable[[int], None] | None) -
         "pictures": pictures,
         "reports": [path and quote(path.relative_to(out).as_posix()) for path in table.reports],
         "places": {"object": object_at, "session": names.index(SESSION)}
-        | {name: _place(table, column) for name, column in _SPECIAL.items()}
-        | ({"piece": _place(table, columns.PIECE)} if has_pieces else {}),
+        | {name: table.places[column] for name, column in _SPECIAL.items() if column in table.places},
     }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -29,11 +29,13 @@ class BatchTable:
         columns: in their order: of the list of sessions, then what was found.
         rows: values in the order of the columns; those of the list of sessions are texts, as they stand there.
         reports: reports of each row, if there is one.
+        places: of each standing column and each that was found its number here, whatever name it had to take.
     """
 
     columns: tuple[Column, ...]
     rows: list[list[Value]]
     reports: list[Path | None]
+    places: Mapping[Column, int]
 
     def values(self, column: Column) -> list[Value]:
         """All values of a column, numbers as numbers."""
@@ -72,7 +74,8 @@ def read_table(out: Path, done: Callable[[int], None] | None = None) -> BatchTab
         numbers = name not in _MEANINGS and any(values) and all(not v or _NUMBER.fullmatch(v) for v in values)
         given.append(Column(name, "", meaning, "list", "number" if numbers else "text"))
     rows = [[*session.values(), *(row.cells.get(column) for column in names)] for session, row in found]
-    return BatchTable((*given, *names.values()), rows, [row.report for _, row in found])
+    places = {column: number for number, column in enumerate(names, start=len(given))}
+    return BatchTable((*given, *names.values()), rows, [row.report for _, row in found], places)
 
 
 def listed_sessions(out: Path) -> list[Row]:
