@@ -54,8 +54,11 @@ def read_objects(folder: Path) -> list[ObjectRow]:
 
     def each_tried(step: str, path: Path, tells: Tells) -> list[Cells]:
         """What a file tells of each object; nothing where it is not there or damaged."""
+        if not path.is_file():
+            return [{}]
         try:
-            return _read(path, step, tells)
+            with content_of(path, f"results of the step {step}", _AGAIN):
+                return [dict(tells(one)) for one in each_object(read_json(path, _AGAIN))]
         except InputError as error:
             wrong.append(_Trouble("damaged", step, str(error).replace(f"{folder}/", "")))
             return [{}]
@@ -63,25 +66,23 @@ def read_objects(folder: Path) -> list[ObjectRow]:
     def tried(step: str, path: Path, tells: Tells) -> Cells:
         return each_tried(step, path, tells)[0]
 
-    cells: Cells = {}
+    costs: Cells = {}
     for step in STEPS:
         found = tried(step, folder / "steps" / f"{step}.json", partial(_cost, step))
         if found.pop(columns.STATUS, None) == "failed":
             wrong.append(_Trouble("failed", step, str(found[columns.SENTENCE])))
-        cells |= {column: value for column, value in found.items() if column is not columns.SENTENCE}
+        found.pop(columns.SENTENCE, None)
+        costs |= found
     failed = [one.step for one in wrong if one.status == "failed" and one.step not in OPTIONAL_STEPS]
     # What lies there of later steps is of an earlier attempt.
     lost = STEPS[STEPS.index(failed[0]) :] if failed else ()
-    costs: Cells = {}
     for total, parts, combined in ((columns.TOTAL, columns.SECONDS, math.fsum), (columns.PEAK, columns.MEMORY, max)):
-        known = [value for column in parts.values() if isinstance(value := cells.get(column), float)]
+        known = [value for column in parts.values() if isinstance(value := costs.get(column), float)]
         if known:
             costs[total] = combined(known)
-    of_cost = {*columns.SECONDS.values(), *columns.MEMORY.values()}
-    costs |= {column: cells.pop(column) for column in tuple(cells) if column in of_cost}
 
     checks = folder / "data" / CHECKS_PATH
-    cells |= tried("inspect", checks if checks.is_file() else folder / INSPECTION_NAME, _findings)
+    cells = tried("inspect", checks if checks.is_file() else folder / INSPECTION_NAME, _findings)
     pieces: list[Cells] = [{}]
     if "traits" not in lost:
         pieces = each_tried("traits", folder / "traits" / "traits.json", _traits)
@@ -96,18 +97,6 @@ def read_objects(folder: Path) -> list[ObjectRow]:
         ObjectRow(cells | (costs if number == 0 else {}) | traits | scores | state, report)
         for number, traits in enumerate(pieces)
     ]
-
-
-def _read(path: Path, step: str, tells: Tells) -> list[Cells]:
-    """What a file tells of each object; nothing where it is not there.
-
-    Raises:
-        InputError: it is damaged.
-    """
-    if not path.is_file():
-        return [{}]
-    with content_of(path, f"results of the step {step}", _AGAIN):
-        return [dict(tells(one)) for one in each_object(read_json(path, _AGAIN))]
 
 
 def _cost(step: str, content: Mapping[str, Any]) -> Iterator[tuple[Column, Value]]:
