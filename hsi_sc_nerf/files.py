@@ -34,7 +34,7 @@ def atomic_write(*paths: Path) -> Iterator[list[Path]]:
 
     The temporary files lie beside the paths, are hidden, and have the same suffixes. If the block fails, they are
     deleted and the files at ``paths`` stay as they are. Missing folders are made. What processes that were killed
-    left of the same files is deleted.
+    left of the same files is deleted. In place of a file the block may make a folder, which replaces a folder.
 
     Raises:
         InputError: the operating system refused to write (full disk, no permission).
@@ -44,12 +44,15 @@ def atomic_write(*paths: Path) -> Iterator[list[Path]]:
         ...     temporary.write_text("a,b")
     """
     temporary = [path.with_name(f"{TEMPORARY_PREFIX}{os.getpid()}-{path.name}") for path in paths]
+    earlier = [path.with_name(f"{TEMPORARY_PREFIX}{os.getpid()}-earlier-{path.name}") for path in paths]
     try:
         for path in paths:
             path.parent.mkdir(parents=True, exist_ok=True)
             delete_remains(path)
         yield temporary
-        for source, target in zip(temporary, paths, strict=True):
+        for source, target, aside in zip(temporary, paths, earlier, strict=True):
+            if source.is_dir() and target.is_dir():
+                os.rename(target, aside)  # a folder cannot replace one that holds something
             os.replace(source, target)
     except OSError as error:
         # Not the temporary name that an outer `atomic_write` has given.
@@ -58,23 +61,25 @@ def atomic_write(*paths: Path) -> Iterator[list[Path]]:
             f"{target}: cannot be written ({error.strerror or error}); free some space or choose another folder."
         ) from error
     finally:
-        for source in temporary:
-            # A file that cannot be deleted was not written; the error above says why.
-            with suppress(OSError):
-                source.unlink(missing_ok=True)
+        for remains in (*temporary, *earlier):
+            _delete(remains)
 
 
 def delete_remains(path: Path) -> None:
     """Delete the temporary files and folders of ``path`` whose processes have ended: these were killed."""
     for remains in path.parent.glob(f"{TEMPORARY_PREFIX}*-{glob.escape(path.name)}"):
         process = remains.name.removeprefix(TEMPORARY_PREFIX).partition("-")[0]
-        if not process.isdecimal() or _is_running(int(process)):
-            continue
-        if remains.is_dir():
-            shutil.rmtree(remains, ignore_errors=True)
-        else:
-            with suppress(OSError):
-                remains.unlink()
+        if process.isdecimal() and not _is_running(int(process)):
+            _delete(remains)
+
+
+def _delete(path: Path) -> None:
+    """Delete a file or a folder; what cannot be deleted stays."""
+    if os.path.isdir(path):  # unlike that of a path, it takes a folder that may not be looked into
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
 
 
 def _is_running(process: int) -> bool:

@@ -9,9 +9,7 @@ from __future__ import annotations
 import importlib
 import math
 import os
-import shutil
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,7 +25,7 @@ from hsi_sc_nerf.export.cloud import (
     write_spectral_ply,
 )
 from hsi_sc_nerf.export.table import WAVELENGTH_ATTRIBUTES, table_attributes, table_columns, table_variables
-from hsi_sc_nerf.files import TEMPORARY_PREFIX, atomic_write, delete_remains, make_folder
+from hsi_sc_nerf.files import atomic_write
 
 CloudFormat = Literal["ply", "las", "netcdf", "zarr"]
 _SUFFIXES: dict[CloudFormat, str] = {"ply": ".ply", "las": ".las", "netcdf": ".nc", "zarr": ".zarr"}
@@ -183,11 +181,7 @@ def _write_zarr(path: Path, cloud: CloudStream) -> None:
 
     sizes = {"point": cloud.count, "wavelength": len(cloud.wavelengths_nm)}
     chunk_sizes = sizes | {"point": max(1, min(CHUNK_POINTS, cloud.count))}
-    # Zarr writes a folder, which `atomic_write` could not delete.
-    temporary = path.with_name(f"{TEMPORARY_PREFIX}{os.getpid()}-{path.name}")
-    try:
-        make_folder(path.parent)
-        delete_remains(path)
+    with atomic_write(path) as (temporary,):
         group = zarr.open_group(str(temporary), mode="w", zarr_format=3)
         group.attrs.update(table_attributes(cloud.run))
 
@@ -203,13 +197,3 @@ def _write_zarr(path: Path, cloud: CloudStream) -> None:
 
         create("wavelength", "<f8", ("wavelength",), WAVELENGTH_ATTRIBUTES)[:] = cloud.wavelengths_nm
         _fill({variable[0]: create(*variable) for variable in _variables(cloud)}, cloud)
-        if path.exists():
-            shutil.rmtree(path)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be written ({error.strerror or error}); free some space or choose another folder."
-        ) from error
-    finally:
-        with suppress(FileNotFoundError):
-            shutil.rmtree(temporary)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from rich.progress import track
 
 from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import TEMPORARY_PREFIX
+from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.simulate import truth
 from hsi_sc_nerf.simulate.effect import find_effect
 from hsi_sc_nerf.simulate.effects.image import ImageRotation
@@ -58,21 +57,9 @@ def simulate_session(scene: Scene, session_dir: str | Path, progress: bool = Tru
     _check_free(session_dir)
     with Console(stderr=True, quiet=not progress).status(f"preparing {scene.name} and its light"):
         simulation = Simulation(scene)
-    target = session_dir.absolute()
-    building, earlier = (target.with_name(f"{TEMPORARY_PREFIX}{os.getpid()}-{kind}-{target.name}") for kind in "ab")
-    try:
-        building.mkdir(parents=True)
+    with atomic_write(session_dir.absolute()) as (building,):
+        building.mkdir()
         _write(simulation, building, progress)
-        if target.exists():
-            os.rename(target, earlier)
-        os.rename(building, target)
-    except OSError as error:
-        raise InputError(
-            f"{session_dir}: cannot be written ({error.strerror or error}); free some space or choose another folder."
-        ) from error
-    finally:
-        for folder in (building, earlier):
-            shutil.rmtree(folder, ignore_errors=True)
     return session_dir
 
 
