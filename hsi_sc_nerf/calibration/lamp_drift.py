@@ -130,7 +130,7 @@ def measure_lamp_drift(
     precision = np.zeros(len(wavelengths_nm))
     precision[lit] = 1.0 / variance
     basis, roughness = smoothing_basis(1.0 / wavelengths_nm, precision)
-    coefficients, covariance = _fit_with_grey_error(log_light, variance, basis[lit], grey_error)
+    coefficients, covariance = fit_over_wavelength(log_light, variance, basis[lit], grey_error)
     curve, variance_of_curve = common_courses(coefficients, covariance, basis, roughness)
     factor = np.exp(curve)
     standard_error = factor * np.sqrt(variance_of_curve + SMALLEST_ERROR**2)
@@ -166,10 +166,14 @@ def fit_over_wavelength(
     log_light: Float[np.ndarray, "frames lit"],
     variance: Float[np.ndarray, "lit"],
     basis: Float[np.ndarray, "lit terms"],
+    grey_error: float,
 ) -> tuple[Float[np.ndarray, "frames terms"], Float[np.ndarray, "terms terms"]]:
     """Weighted least squares of each frame's deviation from the mean frame: coefficients and their covariance.
 
     If the bands scatter about the curves by more than their variances, the covariance is scaled up accordingly.
+
+    Args:
+        grey_error: standard error of the grey level, which all bands share.
     """
     deviation = log_light - log_light.mean(axis=0)
     weighted = basis / variance[:, None]
@@ -178,7 +182,8 @@ def fit_over_wavelength(
     residual = deviation - coefficients @ basis.T
     degrees = (len(log_light) - 1) * max(1, basis.shape[0] - basis.shape[1])
     scatter = float((residual**2 / variance).sum()) / degrees
-    return coefficients, covariance * max(1.0, scatter)
+    constant = np.linalg.lstsq(basis, np.ones(len(basis)), rcond=None)[0]
+    return coefficients, covariance * max(1.0, scatter) + grey_error**2 * np.outer(constant, constant)
 
 
 def drift_p_value(
@@ -194,18 +199,6 @@ def drift_p_value(
     expected = covariance + np.diag(FLOOR**2 / terms / np.square(basis).mean(axis=0))
     distance = np.einsum("fi,ij,fj->", coefficients, np.linalg.inv(expected), coefficients)
     return float(stats.chi2.sf(distance, (frames - 1) * terms))
-
-
-def _fit_with_grey_error(
-    log_light: Float[np.ndarray, "frames lit"],
-    variance: Float[np.ndarray, "lit"],
-    basis: Float[np.ndarray, "lit terms"],
-    grey_error: float,
-) -> tuple[Float[np.ndarray, "frames terms"], Float[np.ndarray, "terms terms"]]:
-    """`fit_over_wavelength`, with the grey level's error, which all bands share, in the covariance."""
-    coefficients, covariance = fit_over_wavelength(log_light, variance, basis)
-    constant = np.linalg.lstsq(basis, np.ones(len(basis)), rcond=None)[0]
-    return coefficients, covariance + grey_error**2 * np.outer(constant, constant)
 
 
 def _bins(wavelengths_nm: Float[np.ndarray, "bands"]) -> Bool[np.ndarray, "bands bins"]:

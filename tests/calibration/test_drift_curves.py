@@ -82,7 +82,7 @@ def test_a_second_course_comes_out_of_the_noise_little_by_little():
 
 def fitted(log_light, variance, wavelengths_nm):
     basis, roughness = smoothing_basis(1.0 / wavelengths_nm, 1.0 / variance)
-    return common_courses(*fit_over_wavelength(log_light, variance, basis), basis, roughness)
+    return common_courses(*fit_over_wavelength(log_light, variance, basis, 0.0), basis, roughness)
 
 
 def test_a_drift_of_the_blue_alone_stays_in_the_blue():

@@ -250,18 +250,19 @@ def test_fits_scatter_as_their_covariance_says():
     variance = np.linspace(1e-6, 1e-4, BANDS)
     light = np.outer([0.0, 1.0], basis @ shape)
     noisy = [light + np.sqrt(variance) * rng.standard_normal(light.shape) for _ in range(800)]
-    repeats = np.array([fit_over_wavelength(one, variance, basis)[0] for one in noisy])
+    repeats = np.array([fit_over_wavelength(one, variance, basis, 0.0)[0] for one in noisy])
     change = repeats[:, 1] - repeats[:, 0]
     np.testing.assert_allclose(change.mean(axis=0), shape, atol=1e-3)
-    _, covariance = fit_over_wavelength(np.zeros(light.shape), variance, basis)
+    _, covariance = fit_over_wavelength(np.zeros(light.shape), variance, basis, 0.0)
     np.testing.assert_allclose(np.var(change, axis=0), 2.0 * np.diag(covariance), rtol=0.2)
 
 
 def test_scatter_beyond_the_noise_makes_the_errors_larger():
     variance, basis = np.full(BANDS, 1e-6), np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, BANDS), 2)
     scatter = 3e-3 * np.random.default_rng(7).standard_normal((20, BANDS))
-    calm = fit_over_wavelength(np.zeros((20, BANDS)), variance, basis)[1]
-    assert fit_over_wavelength(scatter, variance, basis)[1] / calm == pytest.approx(np.full((3, 3), 9.0), rel=0.2)
+    calm = fit_over_wavelength(np.zeros((20, BANDS)), variance, basis, 0.0)[1]
+    scattered = fit_over_wavelength(scatter, variance, basis, 0.0)[1]
+    assert scattered / calm == pytest.approx(np.full((3, 3), 9.0), rel=0.2)
 
 
 @pytest.mark.parametrize(
