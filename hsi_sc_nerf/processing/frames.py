@@ -273,8 +273,15 @@ def fingerprint(content: Any) -> str:
 
 
 def session_files(session: Session) -> list[list[tuple[str, int, int]]]:
-    """Name, size and time of last change of all files of a session."""
-    return [shared_files(session), *(capture_files(session, frame) for frame in session.frames)]
+    """Name, size and time of last change of all files of a session, those that all frames share first.
+
+    These are ``session.json``, the files it names, and the tarp.
+    """
+    paths = [session.info_path, session.band_centres_path, session.panel_reflectance_path]
+    shared = _stamps(session.path, [path for path in paths if path is not None and path.is_file()])
+    if session.white is not None:
+        shared += capture_files(session, session.white)
+    return [shared, *(capture_files(session, frame) for frame in session.frames)]
 
 
 def capture_files(session: Session, capture: Capture) -> list[tuple[str, int, int]]:
@@ -283,16 +290,6 @@ def capture_files(session: Session, capture: Capture) -> list[tuple[str, int, in
     if capture.metadata is not None:
         paths.append(capture.metadata.path)
     return _stamps(session.path, paths)
-
-
-def shared_files(session: Session) -> list[tuple[str, int, int]]:
-    """Name, size and time of last change of the files that every frame's reflectance depends on.
-
-    These are ``session.json``, the files it names, and the tarp.
-    """
-    paths = [session.info_path, session.band_centres_path, session.panel_reflectance_path]
-    stamps = _stamps(session.path, [path for path in paths if path is not None and path.is_file()])
-    return stamps if session.white is None else stamps + capture_files(session, session.white)
 
 
 def _stamps(root: Path, paths: Iterable[Path]) -> list[tuple[str, int, int]]:

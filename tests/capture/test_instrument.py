@@ -12,7 +12,7 @@ from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.capture.instrument import read_metadata
 from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.processing.frames import capture_files, session_files, shared_files
+from hsi_sc_nerf.processing.frames import capture_files, session_files
 
 XML = """<?xml version="1.0" encoding="UTF-8"?>
 <properties><metadata>
@@ -273,7 +273,7 @@ def test_fingerprint_covers_every_file_that_matters(tmp_path):
          for suffix in (".hdr", ".raw")]
         + ["444/results/REFLECTANCE_444.hdr", "444/results/REFLECTANCE_444.dat", "444/metadata/444.xml"]
     )  # fmt: skip
-    shared = {name for name, _, _ in shared_files(session)}
+    shared = {name for name, _, _ in session_files(session)[0]}
     assert {"session.json", "bands.csv", "panel.csv", "white_reference/capture/white_reference.raw"} <= shared
     before = session_files(session)
     (tmp_path / "panel.csv").write_text("wavelength_nm,reflectance\n400,0.98\n1000,0.975\n")
