@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from matplotlib import colormaps, rc_context
+from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from hsi_sc_nerf import paper
@@ -25,6 +25,7 @@ from hsi_sc_nerf.analysis.pictures import (
     draw_rows,
     in_legend,
     paint_classes,
+    paint_values,
 )
 from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.plotting import ANGLE_COLOURS, INDEX_COLOURS, STYLE, new_figure, show_image
@@ -42,19 +43,18 @@ def draw_change(path: Path, first: Day, one: DayComparison, quantity: Quantity, 
 
     Regions up to the limit of blank are striped.
     """
-    colours, low, high, name = _scale(quantity)
-    p = -np.log10(np.clip(quantity.p, _SMALLEST_P, 1.0))
-    lit = colormaps[INDEX_COLOURS](p / -np.log10(_SMALLEST_P))[:, :3]
+    scale, p_scale = _scale(quantity), (0.0, -np.log10(_SMALLEST_P), INDEX_COLOURS)
+    lit = paint_values(-np.log10(np.clip(quantity.p, _SMALLEST_P, 1.0)), *p_scale)
     lit[~quantity.changed] *= 0.6
     undecided = quantity.undecided
     tested = "p-value, -log10\noutlined areas lit" + ("\nundecided striped" if undecided.any() else "")
     rows = {
         "before": views.on_white(_natural(first, first)),
         "after": views.on_white(_natural(one.after, first)),
-        f"{quantity.name}\nchange ({quantity.unit})": views.on_white(colours(quantity.change)),
+        f"{quantity.name}\nchange ({quantity.unit})": views.on_white(paint_values(quantity.change, *scale)),
         tested: views.on_white(np.where(np.isfinite(quantity.change)[:, None], lit, GREY), undecided),
     }
-    draw_rows(path, rows, (None, None, (low, high, name), (0.0, -np.log10(_SMALLEST_P), INDEX_COLOURS)))
+    draw_rows(path, rows, (None, None, scale, p_scale))
 
 
 @rc_context(STYLE)
@@ -91,15 +91,13 @@ def write_film(path: Path, first: Day, comparisons: Sequence[DayComparison], vie
         shown: name of the quantity.
     """
     last = comparisons[-1].quantities[shown]
-    colours, *_ = _scale(last)
-    still = np.where(np.isfinite(last.change), 0.0, np.nan)
-    stills = [_frame(first.name, first, first, colours(still), views, shown)]
+    scale = _scale(last)
+    stills = [_frame(first.name, first, first, paint_values(0.0 * last.change, *scale), views, shown)]
     for one in comparisons:
         changed = one.quantities[shown]
-        lit = np.where(
-            changed.p < FALSE_DISCOVERIES, changed.change, np.where(np.isfinite(changed.change), 0.0, np.nan)
-        )
-        stills.append(_frame(one.after.name, one.after, first, colours(lit), views, shown, changed.undecided))
+        # 0 where nothing is significant, and NaN where nothing is known.
+        lit = paint_values(changed.change * (changed.p < FALSE_DISCOVERIES), *scale)
+        stills.append(_frame(one.after.name, one.after, first, lit, views, shown, changed.undecided))
     with atomic_write(path) as (temporary,), open_video(temporary, _FRAMES_PER_SECOND) as add_frame:
         for before, after in pairwise([*stills, stills[-1]]):
             for _ in range(_HELD_FRAMES):
@@ -143,17 +141,8 @@ def _natural(day: Day, first: Day) -> Float[np.ndarray, "v 3"]:
     return values
 
 
-def _scale(
-    quantity: Quantity,
-) -> tuple[Callable[[Float[np.ndarray, "v"]], Float[np.ndarray, "v 3"]], float, float, str]:
-    """Colours of a change, and the ends and the name of their scale, up to the 99th percentile of this one."""
+def _scale(quantity: Quantity) -> tuple[float, float, str]:
+    """Ends and colours of a change's scale, up to its 99th percentile."""
     size = np.abs(quantity.change[np.isfinite(quantity.change)])
     high = max(float(np.percentile(size, 99.0)) if len(size) else 0.0, 1e-6)
-    low, name = (0.0, ANGLE_COLOURS) if quantity.name == SPECTRUM else (-high, _BOTH_WAYS)
-
-    def colours(values: Float[np.ndarray, "v"]) -> Float[np.ndarray, "v 3"]:
-        painted = colormaps[name](np.clip((np.nan_to_num(values) - low) / (high - low), 0.0, 1.0))[:, :3]
-        painted[~np.isfinite(values)] = GREY
-        return painted
-
-    return colours, low, high, name
+    return (0.0, high, ANGLE_COLOURS) if quantity.name == SPECTRUM else (-high, high, _BOTH_WAYS)

@@ -105,11 +105,10 @@ def draw_maps(
     rows, scales, any_striped = {}, [], False
     for label, values in maps.items():
         known = surface.seen & np.isfinite(values)
-        low, high = usual_range(values[known])
-        coloured = colormaps[INDEX_COLOURS](np.clip((values - low) / (high - low), 0.0, 1.0))[:, :3]
-        coloured[~known] = GREY
-        rows[label] = views.on_white(coloured, striped := surface.seen & ~known)
-        scales.append((low, high, INDEX_COLOURS))
+        scale = (*usual_range(values[known]), INDEX_COLOURS)
+        painted = paint_values(np.where(known, values, np.nan), *scale)
+        rows[label] = views.on_white(painted, striped := surface.seen & ~known)
+        scales.append(scale)
         any_striped |= bool(striped.any())
     draw_rows(path, rows, scales, [_striped("no value is known here")] if any_striped else [])
 
@@ -179,6 +178,12 @@ def draw_classes(
     patches = class_key(there, f"{unlabelled}: {areas_cm2[-1]:.2f} cm²", striped)
     figure.legend(handles=patches, loc="outside lower center", ncols=3, fontsize=8)
     save_figure(figure, path)
+
+
+def paint_values(values: Float[np.ndarray, "v"], low: float, high: float, colours: str) -> Float[np.ndarray, "v 3"]:
+    """Colours of a map between the two ends of its scale at each vertex; grey where it has no value."""
+    fractions = np.clip((np.nan_to_num(values) - low) / (high - low), 0.0, 1.0)
+    return np.where(np.isfinite(values)[:, None], colormaps[colours](fractions)[:, :3], GREY)
 
 
 def paint_classes(labels: Int[np.ndarray, "v"], seen: Bool[np.ndarray, "v"]) -> Float[np.ndarray, "v 3"]:
