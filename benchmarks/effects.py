@@ -10,7 +10,7 @@ views are compared with noise-free ones.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -20,11 +20,9 @@ import numpy as np
 import torch
 import tyro
 from accuracy_and_time import step_seconds
-from jaxtyping import Bool, Float
 from paper_tables import PaperTable, mean_and_deviation
 from results_table import write_results
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
 from hsi_sc_nerf.benchmark.configurations import own_configuration
 from hsi_sc_nerf.benchmark.run import HeldOutViews
@@ -201,36 +199,22 @@ def disturbed_poses(error_deg: float, *arguments: Any, **options: Any) -> Turnta
 
 def against_truth(config: Path, session: Path) -> dict[str, float]:
     """Held-out views against the noise-free light, means over views: on the object, and RMSE beside it."""
-    found: list[dict[str, float]] = []
-    for rendered, light, mask, _ in held_out_views(config, session):
-        metrics = spectral_metrics(rendered, light, mask)
-        beside = (rendered - light)[~mask].square().mean().sqrt()
-        found.append({"sam": metrics["sam"], "rmse": metrics["rmse"], "beside": float(beside)})
-    return {name: float(np.mean([view[name] for view in found])) for name in found[0]}
-
-
-def held_out_views(
-    config: Path, session: Path | None
-) -> Iterator[tuple[Float[Tensor, "h w bands"], Float[Tensor, "h w bands"], Bool[Tensor, "h w"], list[int]]]:
-    """Each held-out view of a run as rendered and as it is, the mask of its object, and the bands to show it in.
-
-    Args:
-        config: of the run.
-        session: simulated, whose noise-free light is what views are; None for views as measured.
-    """
     from nerfstudio.utils.eval_utils import eval_setup
 
     _, pipeline, _, _ = eval_setup(config, test_mode="test")
     pipeline.eval()
-    manager, truth = pipeline.datamanager, None if session is None else load_truth(session)
+    manager, truth = pipeline.datamanager, load_truth(session)
     frames = manager.eval_dataset.metadata["frames"]
+    found: list[dict[str, float]] = []
     for camera, batch in HeldOutViews(manager.fixed_indices_eval_dataloader, None):
         with torch.no_grad():
             rendered = pipeline.model.get_outputs_for_camera(camera)["spectral"].cpu()
-        expected = batch["spectral"]
-        if truth is not None:
-            expected = torch.from_numpy(truth.light(frames[batch["image_idx"]].capture).radiance()).to(rendered)
-        yield rendered, expected, batch["mask"][..., 0].bool(), pipeline.model.rgb_bands
+        light = torch.from_numpy(truth.light(frames[batch["image_idx"]].capture).radiance()).to(rendered)
+        mask = batch["mask"][..., 0].bool()
+        metrics = spectral_metrics(rendered, light, mask)
+        beside = (rendered - light)[~mask].square().mean().sqrt()
+        found.append({"sam": metrics["sam"], "rmse": metrics["rmse"], "beside": float(beside)})
+    return {name: float(np.mean([view[name] for view in found])) for name in found[0]}
 
 
 def decision_rows(case: Case, effects: Sequence[EffectEvidence]) -> list[list[str]]:
