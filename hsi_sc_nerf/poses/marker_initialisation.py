@@ -7,8 +7,6 @@ The layout resolves it: one pose on the object must fit all frames.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -132,18 +130,7 @@ class _Circles:
         )
         up = poses[:, 2, 2]
         flat = np.abs(up) > _HORIZONTAL_COSINE
-        return _turned_over(start) if flat.any() and up[flat].sum() < 0 else start
-
-
-def _turned_over(turntable: Turntable) -> Turntable:
-    """The same turntable with the axis pointing the other way (a half turn about x)."""
-    half_turn = np.diag([1.0, -1.0, -1.0, 1.0])
-    return replace(
-        turntable,
-        camera_rotation=turntable.camera_rotation @ half_turn[:3, :3],
-        angles_rad=-turntable.angles_rad,
-        marker_poses=half_turn @ turntable.marker_poses,
-    )
+        return start.turned_over() if flat.any() and up[flat].sum() < 0 else start
 
 
 def linked_rows(frame: Int[np.ndarray, "n"], marker: Int[np.ndarray, "n"]) -> np.ndarray:

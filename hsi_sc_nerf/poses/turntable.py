@@ -223,6 +223,17 @@ class Turntable:
             motion=None if self.motion is None else self.motion * [1.0, 1.0, factor, factor, factor],
         )
 
+    def turned_over(self) -> Turntable:
+        """The same turntable, without motions, with the axis pointing the other way (a half turn about x)."""
+        half_turn = np.diag([1.0, -1.0, -1.0, 1.0])
+        return replace(
+            self,
+            camera_rotation=self.camera_rotation @ half_turn[:3, :3],
+            angles_rad=-self.angles_rad,
+            marker_poses=half_turn @ self.marker_poses,
+            points_3d=self.points_3d @ half_turn[:3, :3],
+        )
+
     def _landmarks(self, seen):
         """Numbers of this kind's landmarks, of the seen ones; points (l, c, 3) of the former, the latter's pixels."""
         if isinstance(seen, Tracks):

@@ -110,15 +110,7 @@ def upright(turntable: Turntable) -> Turntable:
         turntable: without markers and motions.
     """
     right, down, _ = np.abs(turntable.camera_rotation[:, 2])
-    if right <= down or looks_up_deg(turntable) <= 0.0:
-        return turntable
-    turned_over = np.diag([1.0, -1.0, -1.0])
-    return replace(
-        turntable,
-        camera_rotation=turntable.camera_rotation @ turned_over,
-        angles_rad=-turntable.angles_rad,
-        points_3d=turntable.points_3d @ turned_over,
-    )
+    return turntable if right <= down or looks_up_deg(turntable) <= 0.0 else turntable.turned_over()
 
 
 def looks_up_deg(turntable: Turntable) -> float:
