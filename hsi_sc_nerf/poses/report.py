@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib import rc_context
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
+from hsi_sc_nerf.files import nan_to_none
 from hsi_sc_nerf.findings import Finding, Level, names_in_short
 from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure
 from hsi_sc_nerf.poses.known_angles import check_angles, step_deviation_deg
@@ -163,12 +164,14 @@ def pose_report(
         "intrinsics": asdict(poses.intrinsics),
         "distortion": list(poses.distortion),
         "blur_px": poses.blur_px,
-        "reprojection_error_px": {
-            "overall": _number(poses.overall_error_px),
-            "target": REPROJECTION_TARGET_PX,
-            "above_target": poses.overall_error_px > REPROJECTION_TARGET_PX,
-            "frames": _by_name(poses, poses.reprojection_error_px),
-        },
+        "reprojection_error_px": nan_to_none(
+            {
+                "overall": poses.overall_error_px,
+                "target": REPROJECTION_TARGET_PX,
+                "above_target": poses.overall_error_px > REPROJECTION_TARGET_PX,
+                "frames": _by_name(poses, poses.reprojection_error_px),
+            }
+        ),
         "angles_deg": _by_name(poses, poses.angles_deg),
         "steps_deg": {
             "nominal": info.nominal_step_deg,
@@ -315,8 +318,4 @@ def _uncertainty(poses: TurntablePoses) -> dict | None:
 
 
 def _by_name(poses: TurntablePoses, values: np.ndarray) -> dict[str, float | None]:
-    return {name: _number(value) for name, value in zip(poses.names, values, strict=True)}
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+    return nan_to_none(dict(zip(poses.names, values.tolist(), strict=True)))
