@@ -83,7 +83,7 @@ def fit_marker(
     extent = np.abs(corners_px - centre).max()
     local = (np.stack([columns, rows], -1) + first + 0.5 - centre) / extent
     homography = _homography((corners_px - centre) / extent, cells)
-    footprint = _Footprint.of(corners_px, cells, blur_px, first, inside.shape, centre, extent)
+    footprint = _footprint(corners_px, cells, blur_px, first, inside.shape, centre, extent)
     texture = _texture(dictionary, marker, _texels_per_cell(corners_px, cells))
     unit_corners = _unit_square(cells).astype(float)
     corners = corners_px
@@ -166,39 +166,32 @@ def _homography(corners, cells):
     return cv2.getPerspectiveTransform(corners.astype(np.float32), _unit_square(cells)).ravel()[:8]
 
 
-@dataclass(frozen=True)
-class _Footprint:
-    """What each pixel of a window averages over: its own area and the blur around it, along x times along y.
+def _footprint(
+    corners_px, cells, blur_px, first, shape, centre, extent
+) -> list[tuple[Float[np.ndarray, "samples"], Float[np.ndarray, "pixels samples"]]]:
+    """What each pixel of a window averages over, its own area and the blur around it: along x, then along y.
 
-    The window is sampled on a finer grid; a pixel's row of ``over_x`` and of ``over_y`` weights the samples. Places
-    are relative to the marker's centre, in units of its extent.
+    The window is sampled on a finer grid; a pixel's row of weights belongs to the samples' places, which are relative
+    to the marker's centre, in units of its extent.
     """
-
-    x: Float[np.ndarray, "i"]
-    y: Float[np.ndarray, "j"]
-    over_x: Float[np.ndarray, "w i"]
-    over_y: Float[np.ndarray, "h j"]
-
-    @staticmethod
-    def of(corners_px, cells, blur_px, first, shape, centre, extent):
-        side = np.linalg.norm(np.roll(corners_px, -1, 0) - corners_px, axis=-1)
-        narrowest_cell = quad_area(corners_px) / side.max() / cells
-        # The pattern's edges are sharp, so the samples must be dense on it; a wide blur averages over more of them.
-        samples_per_px = int(np.clip(np.ceil(4.0 / narrowest_cell), 2, 6))
+    side = np.linalg.norm(np.roll(corners_px, -1, 0) - corners_px, axis=-1)
+    narrowest_cell = quad_area(corners_px) / side.max() / cells
+    # The pattern's edges are sharp, so the samples must be dense on it; a wide blur averages over more of them.
+    samples_per_px = int(np.clip(np.ceil(4.0 / narrowest_cell), 2, 6))
+    if blur_px > 0:
+        samples_per_px = int(np.clip(np.ceil(2.5 / blur_px), 1, samples_per_px))
+    margin = int(np.ceil(_BLUR_REACH * blur_px))
+    axes = []
+    for start, size, middle in zip(first, shape[::-1], centre, strict=True):
+        samples = start - margin + (np.arange((size + 2 * margin) * samples_per_px) + 0.5) / samples_per_px
+        offset = samples - (start + np.arange(size) + 0.5)[:, None]
         if blur_px > 0:
-            samples_per_px = int(np.clip(np.ceil(2.5 / blur_px), 1, samples_per_px))
-        margin = int(np.ceil(_BLUR_REACH * blur_px))
-        axes = []
-        for start, size, middle in zip(first, shape[::-1], centre, strict=True):
-            samples = start - margin + (np.arange((size + 2 * margin) * samples_per_px) + 0.5) / samples_per_px
-            offset = samples - (start + np.arange(size) + 0.5)[:, None]
-            if blur_px > 0:
-                weight = ndtr((offset + 0.5) / blur_px) - ndtr((offset - 0.5) / blur_px)
-            else:
-                weight = (np.abs(offset) < 0.5).astype(float)
-            weight /= weight.sum(axis=1, keepdims=True)
-            axes.append(((samples - middle) / extent, weight.astype(np.float32)))
-        return _Footprint(axes[0][0], axes[1][0], axes[0][1], axes[1][1])
+            weight = ndtr((offset + 0.5) / blur_px) - ndtr((offset - 0.5) / blur_px)
+        else:
+            weight = (np.abs(offset) < 0.5).astype(float)
+        weight /= weight.sum(axis=1, keepdims=True)
+        axes.append((((samples - middle) / extent).astype(np.float32), weight.astype(np.float32)))
+    return axes
 
 
 def _texels_per_cell(corners_px, cells):
@@ -220,7 +213,7 @@ def _render(footprint, homography, texture):
 
     Single precision is a millionth of a cell here.
     """
-    x, y = footprint.x.astype(np.float32), footprint.y.astype(np.float32)
+    (x, over_x), (y, over_y) = footprint
     h = np.append(homography, 1.0).astype(np.float32).reshape(3, 3)
     inverse_d, u, v = ((h[k, 1] * y + h[k, 2])[:, None] + h[k, 0] * x for k in (2, 0, 1))
     np.reciprocal(inverse_d, out=inverse_d)
@@ -238,7 +231,7 @@ def _render(footprint, homography, texture):
     rendered, du, dv = cv2.split(seen)
     du *= inverse_d
     dv *= inverse_d
-    over_x, over_y = footprint.over_x.T, footprint.over_y
+    over_x = over_x.T
     jacobian = np.empty((len(over_y), over_x.shape[1], 9))
     for k, derivative in enumerate((du, dv, -(du * u + dv * v))):
         along_x = derivative @ np.concatenate([over_x, over_x * x[:, None]], axis=1)
