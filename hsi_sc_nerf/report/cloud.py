@@ -107,27 +107,23 @@ def _measures(
     of_what: str,
     indices: Sequence[str],
     calibrated: Sequence[_Calibrated],
-) -> Iterator[tuple[str, str, Float[np.ndarray, "n"], tuple[float, float], str]]:
-    """Name, meaning, values, ends of the colours and unit of what spectra tell, the material's where it is known."""
+) -> Iterator[dict[str, Any]]:
+    """What indices and calibrations tell of each point, from the material's spectra where they are known."""
     for index in find_indices(indices, nm):
         values = index_values(index, spectra, nm)
         drawn = index.drawn_range if index.has_range else usual_range(values)
-        yield index.name, f"{index.expression}: {index.tells}{of_what}", values, drawn, ""
+        tells = f"{index.expression}: {index.tells}{of_what}"
+        yield _scalar(index.name, tells, values, drawn) | {"index": True, "unit": ""}
     for one, found in calibrated:
         for label, values in zip(one.classes or ("",), found.T, strict=True):
             drawn = (0.0, 1.0) if label else usual_range(values)
             tells = f"probability by {one.name}" if label else one.unit or "calibration"
-            yield f"{one.name} {label}".strip(), f"{tells}{of_what}", values, drawn, "" if label else one.unit
+            scalar = _scalar(f"{one.name} {label}".strip(), f"{tells}{of_what}", values, drawn)
+            yield scalar | {"index": True, "unit": "" if label else one.unit}
 
 
 _Calibrated = tuple[Calibration, Float[np.ndarray, "n outputs"]]
 """A calibration, and what it says of each point."""
-
-
-def _analysed(cloud: SpectralCloud) -> tuple[Float[np.ndarray, "n bands"], str]:
-    """The spectra that indices and calibrations are computed from, and words for whose they are."""
-    material = material_spectra(cloud)
-    return (cloud.spectra, "") if material is None else (material, ", of the material")
 
 
 def _classified(one: _Calibrated, areas_m2: Float[np.ndarray, "n"]) -> dict[str, Any]:
@@ -167,12 +163,10 @@ def cloud_payload(
     centre, reach_m = (low + high) / 2.0, max(float((high - low).max()) / 2.0, 1e-9)
     areas_m2 = point_areas_m2(cloud.points)
     lengths = np.maximum(np.linalg.norm(cloud.normals, axis=1, keepdims=True), 1e-12)
-    nm, (analysed, of_what) = cloud.wavelengths_nm, _analysed(cloud)
+    nm, material = cloud.wavelengths_nm, material_spectra(cloud)
+    analysed, of_what = (cloud.spectra, "") if material is None else (material, ", of the material")
     calibrated = [(one, one.predictions(analysed, nm, only_inside=True)) for one in calibrations]
-    scalars = [
-        _scalar(name, tells, values, drawn) | {"index": True, "unit": unit}
-        for name, tells, values, drawn, unit in _measures(analysed, nm, of_what, indices, calibrated)
-    ]
+    scalars = [*_measures(analysed, nm, of_what, indices, calibrated)]
     of_material = set(band_property_names(cloud.wavelengths_nm, "material"))
     scalars += [
         _scalar(name, "column of the cloud", values, None)

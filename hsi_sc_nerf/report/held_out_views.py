@@ -105,7 +105,7 @@ class ViewScores:
     angle_rad: Float[np.ndarray, "h w"]
     error: Float[np.ndarray, "h w"]
     mask: Bool[np.ndarray, "h w"]
-    noise_angle_rad: float = math.nan
+    noise_angle_rad: float
 
 
 def score_view(
@@ -123,6 +123,9 @@ def score_view(
     """
     pixels, mse, ssim = (scores[0] for scores in moment_scores(rendered, measured, [mask], valid))
     mse, psnr_db, ssim = (np.where(pixels > 0, score, np.nan) for score in (mse, decibel(mse), ssim))
+    noise_angle_rad = math.nan
+    if noise_std is not None:
+        noise_angle_rad = float(noise_angle(rendered[mask], noise_std.to(rendered.device)).nanmedian())
     return ViewScores(
         name,
         metrics_of_regions(rendered, measured, {"": mask, "full_": None}, valid),
@@ -132,16 +135,8 @@ def score_view(
         angle_rad=spectral_angle_map(rendered, measured, valid).cpu().numpy(),
         error=squared_error_map(rendered, measured, valid).sqrt().cpu().numpy(),
         mask=mask.cpu().numpy(),
-        noise_angle_rad=_noise_angle_rad(rendered, mask, noise_std),
+        noise_angle_rad=noise_angle_rad,
     )
-
-
-def _noise_angle_rad(
-    rendered: Float[Tensor, "h w bands"], mask: Bool[Tensor, "h w"], noise_std: Float[Tensor, "bands"] | None
-) -> float:
-    if noise_std is None:
-        return math.nan
-    return float(noise_angle(rendered[mask], noise_std.to(rendered.device)).nanmedian())
 
 
 def sample_mean_and_sd(
