@@ -98,9 +98,9 @@ def trait_content(
         "regions": {
             region.name: {
                 "area_m2": region.area_m2,
-                "indices": {one.name: _plain(region.maps[one.name]) for one in traits.maps if one.definition},
+                "indices": {one.name: _plain_mean(region.maps[one.name]) for one in traits.maps if one.definition},
                 "calibrations": {
-                    one.name: _plain(region.maps[one.name]) for one in traits.maps if not one.definition
+                    one.name: _plain_mean(region.maps[one.name]) for one in traits.maps if not one.definition
                 },
                 "classifiers": {
                     one.name: _plain_areas(one.classes, region.class_areas[one.name], relative_sd)
@@ -311,13 +311,12 @@ def _plain_reflectance(region: RegionTraits) -> dict[str, float | None]:
     if (light := region.light) is not None:
         values |= {"measured": light.measured.mean.mean(), "irradiance": light.irradiance.mean}
         values["irradiance_std"] = light.irradiance_std
-    return {name: float(value) if np.isfinite(value) else None for name, value in values.items()}
+    return _plain(values)
 
 
 def _bounds(one: SurfaceMap | ClassMap) -> dict[str, float | bool | None]:
     """How well a calibration fits the surface's bands and spectra; no error where no spectrum has a value."""
-    error = one.resampling_error
-    return {"resampling_error": error if math.isfinite(error) else None, "limits": one.limited}
+    return _plain({"resampling_error": one.resampling_error}) | {"limits": one.limited}
 
 
 def _plain_areas(names: Sequence[str], found: ClassAreas, relative_sd: float) -> dict[str, Any]:
@@ -330,16 +329,14 @@ def _plain_areas(names: Sequence[str], found: ClassAreas, relative_sd: float) ->
     }
 
 
-def _plain(value: MapMean) -> dict[str, float | None]:
-    """Ready for JSON."""
-    numbers: dict[str, Any] = {
-        "mean": value.surface.mean,
-        "sd": value.surface.sd,
-        "std": value.std,
-        "outside": value.outside,
-    }
-    plain = {key: float(one) for key, one in numbers.items()}
-    return {key: one if math.isfinite(one) else None for key, one in plain.items()}
+def _plain_mean(value: MapMean) -> dict[str, float | None]:
+    surface = value.surface
+    return _plain({"mean": surface.mean, "sd": surface.sd, "std": value.std, "outside": value.outside})
+
+
+def _plain(numbers: Mapping[str, Any]) -> dict[str, float | None]:
+    """Ready for JSON: null for what is not finite."""
+    return {name: float(value) if math.isfinite(value) else None for name, value in numbers.items()}
 
 
 def _with_sd(value: float | None, sd: float | None, digits: int = 2) -> str:
