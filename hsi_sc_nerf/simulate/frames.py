@@ -13,7 +13,7 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.simulate import assemble
 from hsi_sc_nerf.simulate.effect import effect_rng, find_effect, of_kind
 from hsi_sc_nerf.simulate.effects import detector
-from hsi_sc_nerf.simulate.effects.detector import ExposureEffect, ReadoutContext, ReadoutEffect, SpectralSmile
+from hsi_sc_nerf.simulate.effects.detector import ExposureEffect, ReadoutEffect, SpectralSmile
 from hsi_sc_nerf.simulate.effects.image import (
     Drying,
     IlluminationEffect,
@@ -207,16 +207,8 @@ class Simulation:
         """Digitised counts of a signal in counts above dark, which is overwritten."""
         counts = signal
         counts += self.scene.sensor.dark_level
-        largest = detector.largest_count(self.scene.sensor)
         for effect, rng in zip(self._readout, random, strict=True):
-            context = ReadoutContext(
-                largest_count=largest,
-                dark_level=self.scene.sensor.dark_level,
-                electrons_per_count=self.scene.sensor.full_well_electrons / largest,
-                maps=self.detector_maps[effect.name],
-                rng=rng,
-            )
-            counts = effect.read_out(counts, context)
+            counts = effect.read_out(counts, self.scene.sensor, self.detector_maps[effect.name], rng)
         return detector.digitise(counts, self.scene.sensor)
 
 

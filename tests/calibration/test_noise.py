@@ -14,7 +14,7 @@ from hsi_sc_nerf.calibration.noise import (
     reflectance_uncertainty,
 )
 from hsi_sc_nerf.capture.envi import open_cube
-from hsi_sc_nerf.simulate.effects.detector import PhotonNoise, ReadNoise, ReadoutContext
+from hsi_sc_nerf.simulate.effects.detector import PhotonNoise, ReadNoise, SensorSettings
 
 LINES, SAMPLES, BANDS = 72, 60, 40
 COUNTS_PER_ELECTRON, READ_NOISE = 0.15, 4.0
@@ -152,10 +152,10 @@ EXPOSURES, PIXELS = 250, 40
 
 
 def read_out(signal, rng):
-    context = ReadoutContext(4095, DARK_LEVEL, ELECTRONS_PER_COUNT, {}, rng)
+    sensor = SensorSettings(dark_level=DARK_LEVEL, full_well_electrons=4095 * ELECTRONS_PER_COUNT)
     counts = (signal + DARK_LEVEL).astype(np.float32)
     for effect in (PhotonNoise(), ReadNoise(electrons=READ_ELECTRONS)):
-        counts = effect.read_out(counts, context)
+        counts = effect.read_out(counts, sensor, {}, rng)
     return np.rint(counts).astype(np.float64)
 
 

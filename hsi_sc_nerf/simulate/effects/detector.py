@@ -22,6 +22,7 @@ from hsi_sc_nerf.simulate.effect import Effect
 from hsi_sc_nerf.simulate.light import lamp_photons
 
 Counts: TypeAlias = Float[np.ndarray, "lines samples bands"]
+Maps: TypeAlias = Mapping[str, np.ndarray]
 FEW_ELECTRONS = 50.0
 """Mean below which Poisson numbers are drawn exactly; above it `many_electrons` takes half the time."""
 
@@ -85,6 +86,11 @@ def largest_count(sensor: SensorSettings) -> int:
     return 2**sensor.bit_depth - 1
 
 
+def electrons_per_count(sensor: SensorSettings) -> float:
+    """Gain of the sensor."""
+    return sensor.full_well_electrons / largest_count(sensor)
+
+
 def digitise(counts: Float[np.ndarray, "*n"], sensor: SensorSettings) -> UInt16[np.ndarray, "*n"]:
     """Integer counts from 0 to the largest; overwrites ``counts``."""
     np.rint(counts, out=counts)
@@ -103,25 +109,6 @@ class ExposureEffect(Effect):
         raise NotImplementedError
 
 
-@dataclass(frozen=True)
-class ReadoutContext:
-    """Properties of the sensor and of the exposure that a read-out effect needs.
-
-    Attributes:
-        largest_count: largest count of the digitiser.
-        dark_level: counts without light.
-        electrons_per_count: gain of the sensor.
-        maps: result of the effect's `detector_maps`.
-        rng: random generator of this exposure.
-    """
-
-    largest_count: int
-    dark_level: int
-    electrons_per_count: float
-    maps: Mapping[str, np.ndarray]
-    rng: np.random.Generator
-
-
 class ReadoutEffect(Effect):
     """Changes counts before they are digitised, in frames, white and dark cubes alike."""
 
@@ -129,8 +116,13 @@ class ReadoutEffect(Effect):
         """Maps (samples, bands) that are the same in every exposure, by name; stored with the truth."""
         return {}
 
-    def read_out(self, counts: Counts, context: ReadoutContext) -> Counts:
-        """Counts under the effect, dark level included, neither rounded nor clipped; may overwrite ``counts``."""
+    def read_out(self, counts: Counts, sensor: SensorSettings, maps: Maps, rng: np.random.Generator) -> Counts:
+        """Counts under the effect, dark level included, neither rounded nor clipped; may overwrite ``counts``.
+
+        Args:
+            maps: result of the effect's `detector_maps`.
+            rng: random generator of this exposure.
+        """
         raise NotImplementedError
 
 
@@ -201,9 +193,9 @@ class DarkPattern(ReadoutEffect):
         """``dark_offset``: counts to add to the dark level, float32, normal."""
         return {"dark_offset": np.float32(self.spread) * rng.standard_normal((samples, bands), dtype=np.float32)}
 
-    def read_out(self, counts: Counts, context: ReadoutContext) -> Counts:
+    def read_out(self, counts: Counts, sensor: SensorSettings, maps: Maps, rng: np.random.Generator) -> Counts:
         """Add the fixed pattern."""
-        counts += context.maps["dark_offset"]
+        counts += maps["dark_offset"]
         return counts
 
 
@@ -238,10 +230,10 @@ class BadPixels(ReadoutEffect):
         of_hot[:, dead_bands] = False
         return {"dead": of_dead, "hot": of_hot}
 
-    def read_out(self, counts: Counts, context: ReadoutContext) -> Counts:
+    def read_out(self, counts: Counts, sensor: SensorSettings, maps: Maps, rng: np.random.Generator) -> Counts:
         """Overwrite the counts of bad pixels."""
-        counts[:, context.maps["dead"]] = context.dark_level
-        counts[:, context.maps["hot"]] = context.largest_count
+        counts[:, maps["dead"]] = sensor.dark_level
+        counts[:, maps["hot"]] = largest_count(sensor)
         return counts
 
 
@@ -251,15 +243,15 @@ class PhotonNoise(ReadoutEffect):
 
     name: ClassVar[str] = "photon_noise"
 
-    def read_out(self, counts: Counts, context: ReadoutContext) -> Counts:
+    def read_out(self, counts: Counts, sensor: SensorSettings, maps: Maps, rng: np.random.Generator) -> Counts:
         """Draw the electrons of the signal above the dark level and convert them back to counts."""
-        electrons = np.maximum(counts - np.float32(context.dark_level), 0.0, dtype=np.float32)
-        electrons *= np.float32(context.electrons_per_count)
+        electrons = np.maximum(counts - np.float32(sensor.dark_level), 0.0, dtype=np.float32)
+        electrons *= np.float32(electrons_per_count(sensor))
         # One line at a time fits in the processor's cache.
         for line in electrons:
-            line[...] = poisson(line, context.rng)
-        electrons /= np.float32(context.electrons_per_count)
-        electrons += np.float32(context.dark_level)
+            line[...] = poisson(line, rng)
+        electrons /= np.float32(electrons_per_count(sensor))
+        electrons += np.float32(sensor.dark_level)
         return electrons
 
 
@@ -271,11 +263,11 @@ class ReadNoise(ReadoutEffect):
     electrons: float = between(0.0, 1e5, default=40.0)
     """Root mean square, electrons."""
 
-    def read_out(self, counts: Counts, context: ReadoutContext) -> Counts:
+    def read_out(self, counts: Counts, sensor: SensorSettings, maps: Maps, rng: np.random.Generator) -> Counts:
         """Add the noise."""
-        spread = np.float32(self.electrons / context.electrons_per_count)
+        spread = np.float32(self.electrons / electrons_per_count(sensor))
         for line in counts:
-            line += spread * context.rng.standard_normal(line.shape, dtype=np.float32)
+            line += spread * rng.standard_normal(line.shape, dtype=np.float32)
         return counts
 
 
