@@ -32,31 +32,20 @@ def revolve(profile: Float[np.ndarray, "n 2"], segments: int) -> Mesh:
     profile = np.asarray(profile, float)
     azimuth = 2.0 * np.pi * np.arange(segments) / segments
     radius, height = profile[1:-1].T
-    rings = np.stack(
-        [
-            radius[:, None] * np.cos(azimuth),
-            radius[:, None] * np.sin(azimuth),
-            np.broadcast_to(height[:, None], (len(radius), segments)),
-        ],
-        axis=-1,
-    ).reshape(-1, 3)
+    on_rings = radius[:, None] * np.cos(azimuth), radius[:, None] * np.sin(azimuth), height[:, None]
+    rings = np.stack(np.broadcast_arrays(*on_rings), axis=-1).reshape(-1, 3)
     vertices = np.concatenate([[[0.0, 0.0, profile[0, 1]]], rings, [[0.0, 0.0, profile[-1, 1]]]])
 
-    k = np.arange(segments)
-    following = (k + 1) % segments
-    first, last = 1, 1 + (len(radius) - 1) * segments
-    lower_cap = np.stack([np.zeros_like(k), first + following, first + k], axis=-1)
-    upper_cap = np.stack([np.full_like(k, len(vertices) - 1), last + k, last + following], axis=-1)
-    ring = 1 + segments * np.arange(len(radius) - 1)[:, None]
-    below, below_next = ring + k, ring + following
-    above, above_next = below + segments, below_next + segments
-    walls = np.concatenate(
-        [
-            np.stack([below, below_next, above_next], axis=-1).reshape(-1, 3),
-            np.stack([below, above_next, above], axis=-1).reshape(-1, 3),
-        ]
+    ring = 1 + np.arange(len(rings)).reshape(-1, segments)
+    following = np.roll(ring, -1, axis=1)
+    below, below_next, above, above_next = ring[:-1], following[:-1], ring[1:], following[1:]
+    parts = (
+        (np.zeros_like(ring[0]), following[0], ring[0]),
+        (below, below_next, above_next),
+        (below, above_next, above),
+        (np.full_like(ring[0], len(vertices) - 1), ring[-1], following[-1]),
     )
-    return Mesh(vertices, np.concatenate([lower_cap, walls, upper_cap]))
+    return Mesh(vertices, np.concatenate([np.stack(corners, axis=-1).reshape(-1, 3) for corners in parts]))
 
 
 def sphere(diameter_m: float) -> Mesh:

@@ -107,10 +107,8 @@ def maize(height_m: float, rng: np.random.Generator) -> PlantMesh:
     relief = MAIZE_KERNEL_RELIEF_M * fade * np.minimum(1.0, radius / (0.12 * height_m))
     wobble = rng.uniform(0.75, 1.15, (MAIZE_ROWS, int(along.max()) + 2))[row, np.floor(along).astype(int)]
     factor = np.divide(radius + relief * (dome * wobble - 0.6), radius, out=np.ones_like(radius), where=radius > 0)
-    vertices = mesh.vertices * np.stack([factor, factor, np.ones_like(factor)], axis=-1)
-    bent = _bend(vertices, height_m, 0.03, rng)
     return PlantMesh(
-        mesh=Mesh(_stand(bent, height_m), mesh.triangles),
+        mesh=_grown(mesh, factor, height_m, 0.03, rng),
         stem=1.0 - smoothstep((z - low + 0.002) / 0.003),
         kernel=row * (int(along.max()) + 2) + np.floor(along).astype(int),
         groove=1.0 - smoothstep((dome - 0.25) / 0.3),
@@ -129,10 +127,9 @@ def tomato(height_m: float, rng: np.random.Generator) -> PlantMesh:
     low, high = TOMATO_RIB_RELIEF
     depth = low + (high - low) * smoothstep((z / height_m - 0.15) / 0.7)
     swell = 1.0 + 0.03 * np.cos(2.0 * azimuth + phase[3]) - depth * (1.0 - rib)
-    vertices = mesh.vertices * np.stack([swell, swell, np.ones_like(swell)], axis=-1)
     on_floor = 1.0 - smoothstep((np.hypot(x, y) / height_m - 0.75 * TOMATO_SCAR_RADIUS) / (0.5 * TOMATO_SCAR_RADIUS))
     scar = np.where(z > 0.5 * height_m, on_floor, 0.0)
-    return PlantMesh(mesh=Mesh(_stand(_bend(vertices, height_m, 0.04, rng), height_m), mesh.triangles), stem=scar)
+    return PlantMesh(mesh=_grown(mesh, swell, height_m, 0.04, rng), stem=scar)
 
 
 def _fruit(
@@ -155,25 +152,21 @@ def _fruit(
     azimuth = np.arctan2(mesh.vertices[:, 1], mesh.vertices[:, 0]) % (2.0 * np.pi)
     phase = rng.uniform(0.0, 2.0 * np.pi, 2)
     swell = 1.0 + 0.02 * np.cos(2.0 * azimuth + phase[0]) + lobe_depth * np.cos(lobes * azimuth + phase[1])
-    vertices = mesh.vertices * np.stack([swell, swell, np.ones_like(swell)], axis=-1)
-    vertices = _bend(vertices, height_m, bend, rng)
-    return PlantMesh(mesh=Mesh(_stand(vertices, height_m), mesh.triangles), stem=on_stem.astype(float))
+    return PlantMesh(mesh=_grown(mesh, swell, height_m, bend, rng), stem=on_stem.astype(float))
 
 
-def _stand(vertices: Float[np.ndarray, "v 3"], height_m: float) -> Float[np.ndarray, "v 3"]:
-    """Flatten the lowest 1 % of the height, so that the object stands on an area; the height stays the same."""
-    x, y, z = vertices.T
-    z = np.maximum(z - z.min() - 0.01 * height_m, 0.0)
-    return np.stack([x, y, z * height_m / z.max()], axis=-1)
+def _grown(mesh: Mesh, swell: Float[np.ndarray, "v"], height_m: float, bend: float, rng: np.random.Generator) -> Mesh:
+    """A surface of revolution with its radii times ``swell``, bent, on a flat base and as tall as before.
 
-
-def _bend(
-    vertices: Float[np.ndarray, "v 3"], height_m: float, amount: float, rng: np.random.Generator
-) -> Float[np.ndarray, "v 3"]:
-    """Shear the top sideways by ``amount`` of the height, quadratic in height; the volume stays the same."""
+    The top is sheared sideways by ``bend`` of the height, quadratic in height, which keeps the volume. The lowest 1 %
+    of the height is flattened, so that the object stands on an area.
+    """
+    x, y, z = mesh.vertices.T
     azimuth = rng.uniform(0.0, 2.0 * np.pi)
-    shift = amount * height_m * (vertices[:, 2] / height_m) ** 2
-    return vertices + np.stack([shift * np.cos(azimuth), shift * np.sin(azimuth), np.zeros_like(shift)], axis=-1)
+    shift = bend * height_m * (z / height_m) ** 2
+    standing = np.maximum(z - z.min() - 0.01 * height_m, 0.0)
+    bent = x * swell + shift * np.cos(azimuth), y * swell + shift * np.sin(azimuth)
+    return Mesh(np.stack([*bent, standing * height_m / standing.max()], axis=-1), mesh.triangles)
 
 
 def _smooth(nodes: Float[np.ndarray, "n 2"], *, closed_top: bool) -> Float[np.ndarray, "m 2"]:
