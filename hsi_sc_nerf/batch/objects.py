@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,31 +22,22 @@ from hsi_sc_nerf.processing.session_checks import CHECKS_PATH
 _AGAIN = "delete it and start the batch again"
 _LEVELS = ("green", "amber", "red")
 Cells = dict[Column, Value]
+"""A row; what is missing has no value."""
 Tells = Callable[[Mapping[str, Any]], Iterator[tuple[Column, Value]]]
 """What is to be read from the content of a file."""
 
 
-@dataclass(frozen=True)
-class ObjectRow:
-    """What is known of one object.
-
-    Attributes:
-        cells: values by column; what is missing has none.
-        report: its report, if there is one.
-    """
-
-    cells: Cells
-    report: Path | None
-
-
-def read_objects(folder: Path) -> list[ObjectRow]:
+def read_objects(folder: Path) -> tuple[list[Cells], Path | None]:
     """The row of the object whose results lie in ``folder``, or of each of several that stood on the table.
 
     Nothing there can make it fail.
 
+    Returns:
+        The rows, and the report, if there is one.
+
     Example:
-        >>> (row,) = read_objects(Path("season/objects/pear_01"))
-        >>> row.cells[STATUS]
+        >>> (row,), report = read_objects(Path("season/objects/pear_01"))
+        >>> row[STATUS]
         'done'
     """
     wrong: list[_Trouble] = []
@@ -91,12 +81,9 @@ def read_objects(folder: Path) -> list[ObjectRow]:
     status = serious[0].status if serious else "done" if pieces[0] and scores else "unfinished"
     told = (serious or wrong or [_Trouble("", "", "")])[0]
     state: Cells = {columns.STATUS: status, columns.STEP: told.step, columns.SENTENCE: told.sentence}
-    path = folder / "report.html"
-    report = path if path.is_file() and "report" not in lost else None
-    return [
-        ObjectRow(cells | (costs if number == 0 else {}) | traits | scores | state, report)
-        for number, traits in enumerate(pieces)
-    ]
+    report = folder / "report.html"
+    rows = [cells | (costs if number == 0 else {}) | traits | scores | state for number, traits in enumerate(pieces)]
+    return rows, report if report.is_file() and "report" not in lost else None
 
 
 def _cost(step: str, content: Mapping[str, Any]) -> Iterator[tuple[Column, Value]]:

@@ -64,18 +64,19 @@ def read_table(out: Path, done: Callable[[int], None] | None = None) -> BatchTab
     sessions = listed_sessions(out)
     header, found = [*sessions[0]], []
     for number, session in enumerate(sessions, start=1):
-        found += [(session, row) for row in read_objects(out / OBJECTS_NAME / session[OBJECT])]
+        of_session, report = read_objects(out / OBJECTS_NAME / session[OBJECT])
+        found += [(session, cells, report) for cells in of_session]
         if done is not None:
             done(number)
-    names = named_apart(header, {column for _, row in found for column in row.cells})
+    names = named_apart(header, {column for _, cells, _ in found for column in cells})
     given = []
     for name in header:
         meaning, values = _MEANINGS.get(name, "column of the list of sessions"), [one[name] for one in sessions]
         numbers = name not in _MEANINGS and any(values) and all(not v or _NUMBER.fullmatch(v) for v in values)
         given.append(Column(name, "", meaning, "list", "number" if numbers else "text"))
-    rows = [[*session.values(), *(row.cells.get(column) for column in names)] for session, row in found]
+    rows = [[*session.values(), *(cells.get(column) for column in names)] for session, cells, _ in found]
     places = {column: number for number, column in enumerate(names, start=len(given))}
-    return BatchTable((*given, *names.values()), rows, [row.report for _, row in found], places)
+    return BatchTable((*given, *names.values()), rows, [report for *_, report in found], places)
 
 
 def listed_sessions(out: Path) -> list[Row]:

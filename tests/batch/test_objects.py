@@ -11,8 +11,8 @@ from hsi_sc_nerf.files import write_json
 
 
 def row_of(folder):
-    (row,) = read_objects(folder)
-    return {column.name: value for column, value in row.cells.items()}, row.report
+    (row,), report = read_objects(folder)
+    return {column.name: value for column, value in row.items()}, report
 
 
 def test_a_row_has_what_the_files_say_in_the_columns_units(tmp_path):
@@ -68,7 +68,8 @@ def test_objects_that_stood_on_one_table_have_a_row_each(tmp_path):
         for number, volume in ((1, 250.0), (2, 120.0))
     ]
     write_object(tmp_path / "berries", {"pieces": pieces})
-    rows = [{column.name: value for column, value in row.cells.items()} for row in read_objects(tmp_path / "berries")]
+    rows, _ = read_objects(tmp_path / "berries")
+    rows = [{column.name: value for column, value in row.items()} for row in rows]
     assert [row["volume_ml"] for row in rows] == [pytest.approx(250.0), pytest.approx(120.0)]
     assert [(row["piece"], row["piece_x_mm"], row["status"]) for row in rows] == [(1, 20, "done"), (2, 40, "done")]
     assert [row["sam_rad"] for row in rows] == [0.03, 0.03]
