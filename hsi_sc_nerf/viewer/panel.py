@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -140,7 +139,7 @@ class SpectralPanel(torch.nn.Module):
             camera: one camera, of a frame or of the viewer.
             render: the model's ``get_outputs_for_camera``.
         """
-        viewer = self._viewer()
+        viewer: Viewer | None = getattr(self.control, "viewer", None)
         if viewer is None or FRAME_INDEX in (camera.metadata or {}):
             return render(camera)
         views = _training_views(viewer)
@@ -169,44 +168,40 @@ class SpectralPanel(torch.nn.Module):
         """Show the rendered spectrum at a click and, at a training view, the measured one; mark the point."""
         from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 
-        viewer = self._viewer()
-        assert viewer is not None
-        point, curves, title, notes = self.spectrum_at(click)
+        viewer = self.control.viewer
+        position, curves, title, notes = self.spectrum_at(click)
         plot = spectra_plot(self.wavelengths_nm, curves, title)
         self.spectrum.show(f"{inline_image(plot, 'spectrum of the point')}\n\n{title}, {notes}")
         viewer.viser_server.scene.add_icosphere(
             "/picked_point",
             radius=_POINT_RADIUS * VISER_NERFSTUDIO_SCALE_RATIO,
             color=_POINT_RGB,
-            position=point.position.double().numpy() * VISER_NERFSTUDIO_SCALE_RATIO,
+            position=position.double().numpy() * VISER_NERFSTUDIO_SCALE_RATIO,
         )
 
-    def spectrum_at(self, click: ViewerClick) -> tuple[PickedPoint, dict[str, Float[np.ndarray, "bands"]], str, str]:
-        """The point under a click, its spectra by name (rendered, and measured at a training view), and two texts:
-        where it is, and how far it can be trusted."""
-        viewer = self._viewer()
-        assert viewer is not None
+    def spectrum_at(
+        self, click: ViewerClick
+    ) -> tuple[Float[Tensor, "3"], dict[str, Float[np.ndarray, "bands"]], str, str]:
+        """The point under a click (scene units), its spectra by name (rendered, and measured at a training view), and
+        two texts: where it is, and how far it can be trusted."""
+        viewer = self.control.viewer
         views = _training_views(viewer)
         origin, direction = torch.tensor(click.origin).float(), torch.tensor(click.direction).float()
         view = views.at(origin)
         metadata = {} if view is None else views.metadata(view, "cpu")
         with viewer.train_lock or contextlib.nullcontext():
-            point = pick(viewer.get_model(), origin, direction, metadata)  # type: ignore[arg-type]
-        curves, notes = {"rendered": point.spectrum.numpy()}, f"opacity {point.opacity:.2f}"
+            position, opacity, spectrum = pick(viewer.get_model(), origin, direction, metadata)  # type: ignore[arg-type]
+        curves, notes = {"rendered": spectrum.numpy()}, f"opacity {opacity:.2f}"
         if view is not None:
             measured, valid, seen = views.measured(view, direction[None])
             if seen.item():
                 curves["measured"] = np.where(valid[0], measured[0], np.nan)
-                angle = float(spectral_angle_map(point.spectrum[None, None], measured[None], valid[None]))
+                angle = float(spectral_angle_map(spectrum[None, None], measured[None], valid[None]))
                 notes += f", spectral angle {angle:.3f} rad to {views.dataset.frames[view].capture}"
         # From the scene to metres in the object frame.
         parsed: Any = viewer.pipeline.datamanager.train_dataparser_outputs
-        millimetres = (point.position / parsed.dataparser_scale - parsed.dataparser_transform[:, 3]) * 1000.0
-        return point, curves, "x {:.1f}, y {:.1f}, z {:.1f} mm".format(*millimetres.tolist()), notes
-
-    def _viewer(self) -> Viewer | None:
-        """The attached viewer; None without one."""
-        return getattr(self.control, "viewer", None)
+        millimetres = (position / parsed.dataparser_scale - parsed.dataparser_transform[:, 3]) * 1000.0
+        return position, curves, "x {:.1f}, y {:.1f}, z {:.1f} mm".format(*millimetres.tolist()), notes
 
     def _dropdown(self, label: str, names: list[str]) -> ViewerDropdown | None:
         """A choice of what the output of the label's name shows; None without choices."""
@@ -245,8 +240,7 @@ class SpectralPanel(torch.nn.Module):
         """Show a browser the object, with a scale bar that follows its camera."""
         from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 
-        viewer = self._viewer()
-        assert viewer is not None
+        viewer = self.control.viewer
         parsed: Any = viewer.pipeline.datamanager.train_dataparser_outputs
         centre = VISER_NERFSTUDIO_SCALE_RATIO * parsed.metadata["object_box"].mean(dim=0).double().numpy()
         units_per_m = VISER_NERFSTUDIO_SCALE_RATIO * float(parsed.dataparser_scale)
@@ -255,8 +249,7 @@ class SpectralPanel(torch.nn.Module):
 
     def _move_all_to(self, view: int) -> None:
         """Move the cameras of all browsers to a training view."""
-        viewer = self._viewer()
-        assert viewer is not None
+        viewer = self.control.viewer
         for client in viewer.viser_server.get_clients().values():
             self._move_to(client, view)
 
@@ -270,8 +263,7 @@ class SpectralPanel(torch.nn.Module):
         """
         from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 
-        viewer = self._viewer()
-        assert viewer is not None
+        viewer = self.control.viewer
         views = _training_views(viewer)
         rotation = SO3.from_matrix(views.rotations[view].double().numpy()) @ SO3.from_x_radians(np.pi)
         ahead = rotation.as_matrix()[:, 2] * views.distance(view) * VISER_NERFSTUDIO_SCALE_RATIO
@@ -295,23 +287,12 @@ def _training_views(viewer: Viewer) -> TrainingViews:
     return TrainingViews(cast(SpectralDataset, viewer.pipeline.datamanager.train_dataset))
 
 
-@dataclass(frozen=True, eq=False)
-class PickedPoint:
-    """The rendered surface point of a ray."""
-
-    position: Float[Tensor, "3"]
-    """Position at the median depth, scene units."""
-    opacity: float
-    spectrum: Float[Tensor, "bands"]
-    """Rendered spectrum, background included."""
-
-
 def pick(
     model: SpectralModel,
     origin: Float[Tensor, "3"],
     direction: Float[Tensor, "3"],
     metadata: dict[str, Float[Tensor, "1 ..."]],
-) -> PickedPoint:
+) -> tuple[Float[Tensor, "3"], float, Float[Tensor, "bands"]]:
     """Render one ray in evaluation mode and restore the mode of the model.
 
     Args:
@@ -319,6 +300,9 @@ def pick(
         origin: origin of the ray, scene units.
         direction: direction of the ray, of any length.
         metadata: metadata of the frame to which the ray belongs; empty for none.
+
+    Returns:
+        The surface point at the median depth (scene units), its opacity, and its spectrum, background included.
     """
     unit = direction / direction.norm()
     rays = RayBundle(
@@ -336,4 +320,4 @@ def pick(
     finally:
         model.train(was_training)
     depth, opacity, spectrum = (outputs[name][0].cpu() for name in ("depth", "accumulation", "spectral"))
-    return PickedPoint(origin + unit * depth, float(opacity), spectrum)
+    return origin + unit * depth, float(opacity), spectrum

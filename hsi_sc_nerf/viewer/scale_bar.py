@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,30 +22,13 @@ _UNDER, _OVER = ((20, 20, 20), 7.0, 1.0), ((255, 255, 255), 3.0, 0.999)
 """Colour, width in pixels and depth of two lines, the second on the first: one is seen on any ground."""
 
 
-@dataclass(frozen=True)
-class ScaleBar:
-    """A bar in front of a camera.
+def scale_bar(
+    camera: CameraHandle, centre: Float[np.ndarray, "3"], units_per_m: float
+) -> tuple[float, Float[np.ndarray, "2 3"]] | None:
+    """The length (metres) that the bar for a browser's camera stands for, and its left and right end (scene).
 
-    Attributes:
-        length_m: that it stands for.
-        start: its left end, scene.
-        end: its right end, scene.
-    """
-
-    length_m: float
-    start: Float[np.ndarray, "3"]
-    end: Float[np.ndarray, "3"]
-
-    @property
-    def words(self) -> str:
-        """The length as its label has it."""
-        return f"{1e3 * self.length_m:g} mm"
-
-
-def scale_bar(camera: CameraHandle, centre: Float[np.ndarray, "3"], units_per_m: float) -> ScaleBar | None:
-    """The bar for a browser's camera; None if the object's centre is not in front of it.
-
-    It hangs near the camera and is smaller by as much, so that it looks as it would at the centre's depth.
+    The bar hangs near the camera and is smaller by as much, so that it looks as it would at the centre's depth. None
+    if the object's centre is not in front of the camera.
 
     Args:
         camera: camera of the browser: its place, turn, vertical field of view (rad) and width over height.
@@ -63,7 +45,7 @@ def scale_bar(camera: CameraHandle, centre: Float[np.ndarray, "3"], units_per_m:
     length_m = round_length(longest_m)
     start = depth * ahead - _CORNER * half_width * right + _CORNER * half_height * down
     end = start + length_m * units_per_m * right
-    return ScaleBar(length_m, camera.position + _NEAR * start, camera.position + _NEAR * end)
+    return length_m, camera.position + _NEAR * np.stack([start, end])
 
 
 def round_length(longest: float) -> float:
@@ -82,11 +64,11 @@ def draw_scale_bar(client: Any, centre: Float[np.ndarray, "3"], units_per_m: flo
     """Draw the bar in a browser in place of its last one; nothing where there is none to draw."""
     camera = client.camera
     bar = scale_bar(camera, centre, units_per_m)
+    length_m, at = bar or (0.0, np.zeros((2, 3)))
     for number, (colour, width_px, depth) in enumerate((_UNDER, _OVER)):
-        at = np.stack([bar.start, bar.end]) if bar else np.zeros((2, 3))
         ends = camera.position + depth * (at - camera.position)
         client.scene.add_spline_catmull_rom(
             f"/scale_bar/{number}", ends, line_width=width_px, color=colour, segments=1, visible=bar is not None
         )
-    middle = (bar.start + bar.end) / 2.0 if bar else np.zeros(3)
-    client.scene.add_label("/scale_bar/length", bar.words if bar else "", position=middle, visible=bar is not None)
+    words = f"{1e3 * length_m:g} mm" if bar else ""
+    client.scene.add_label("/scale_bar/length", words, position=at.mean(axis=0), visible=bar is not None)
