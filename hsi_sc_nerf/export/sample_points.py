@@ -31,7 +31,7 @@ from hsi_sc_nerf.export.cloud import (
     own_name,
 )
 from hsi_sc_nerf.files import atomic_write
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project
+from hsi_sc_nerf.geometry.camera import pixels_of
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.geometry.ply_file import ply_vertices, read_ply
 from hsi_sc_nerf.models.spectral_model import SpectralModel
@@ -174,7 +174,7 @@ def _render_views(
     distances = np.linalg.norm(to_point, axis=-1)
     directions = to_point / distances[..., None]
     cosines = -np.einsum("nk,nck->nc", normals, directions)
-    in_frame = np.stack([_in_frame(points, pose, intrinsics) for pose in poses], axis=1)
+    in_frame = np.stack([pixels_of(points, pose, intrinsics)[0] for pose in poses], axis=1)
     cameras, facing = frontal_views(cosines, in_frame)
     bands, chunk = len(model.wavelengths_nm), model.config.eval_num_rays_per_chunk
 
@@ -216,13 +216,6 @@ def _render_rays(
 def _density(model: SpectralModel, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 1"]:
     parts = torch.from_numpy(points).float().to(model.device)[:, None].split(BATCH_POINTS)
     return torch.cat([model.field.density_fn(part)[:, 0] for part in parts]).cpu().numpy()
-
-
-def _in_frame(
-    points: Float[np.ndarray, "n 3"], pose: Float[np.ndarray, "4 4"], intrinsics: PinholeIntrinsics
-) -> Bool[np.ndarray, "n"]:
-    pixels, depth = project(points, pose, intrinsics)
-    return (depth > 0.0) & ((pixels >= 0.0) & (pixels < (intrinsics.w, intrinsics.h))).all(axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
