@@ -166,8 +166,7 @@ def _hull(
     """Masks that contradict the visual hull, which is found by vote."""
     silhouettes = hull.silhouettes
     filled = masks.any(axis=(1, 2))  # an empty mask has its own finding
-    contradiction = _contradiction(masks, silhouettes)
-    typical = float(np.median(contradiction[filled]))
+    typical = float(np.median(_contradiction(masks, silhouettes)[filled]))
     outline = masks & ~binary_erosion(masks, np.ones((1, 3, 3), bool))
     pixel = outline.sum() / masks.sum()
     limit = MAX_CONTRADICTION + 0.25 * pixel
@@ -181,12 +180,12 @@ def _hull(
         )
         return [Finding("masks-hull", "red", sentence, {"contradiction": typical})]
     excess = MAX_ODDITY + 0.125 * pixel
-    odd, contradiction = _odd(masks, silhouettes, contradiction, brightness, excess)
+    odd, contradiction = _odd(masks, silhouettes, brightness, excess)
     if not odd.any():
         return []
     # The outermost frames of a part of a turn carve alone and are outvoted, but the core agrees with all masks.
     core = hull.core_silhouettes
-    odd_to_core, to_core = _odd(masks, core, _contradiction(masks, core), brightness, excess)
+    odd_to_core, to_core = _odd(masks, core, brightness, excess)
     if not odd_to_core.any() and np.median(to_core[filled]) <= typical:
         return []
     others = {name: float(c) for name, c, is_odd in zip(names, contradiction, odd, strict=True) if is_odd}
@@ -200,16 +199,11 @@ def _hull(
 def _odd(
     masks: Bool[np.ndarray, "frames h w"],
     silhouettes: Bool[np.ndarray, "frames h w"],
-    contradiction: Float[np.ndarray, "frames"],
     brightness: Float[np.ndarray, "frames h w"],
     excess: float,
 ) -> tuple[Bool[np.ndarray, "frames"], Float[np.ndarray, "frames"]]:
-    """Which masks contradict their silhouettes by ``excess`` more than a typical one; contradiction without noise.
-
-    Args:
-        contradiction: contradiction of the masks and their silhouettes, noise included.
-    """
-    filled = masks.any(axis=(1, 2))
+    """Which masks contradict their silhouettes by ``excess`` more than a typical one; contradiction without noise."""
+    filled, contradiction = masks.any(axis=(1, 2)), _contradiction(masks, silhouettes)
     scatter = float(median_abs_deviation(contradiction[filled], scale="normal"))
     limit = float(np.median(contradiction[filled])) + max(excess, ODDITY_SIGMAS * scatter)
     trimmed = _contradiction(masks & ~_background(masks, silhouettes, brightness), silhouettes)
