@@ -7,7 +7,7 @@ its foot stands on the disc.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 from scipy.ndimage import gaussian_filter1d
 
 from hsi_sc_nerf.geometry.camera import cross_matrix
-from hsi_sc_nerf.poses.turntable import Turntable
+from hsi_sc_nerf.poses.turntable import Turntable, project
 from hsi_sc_nerf.robust_scatter import robust_std
 
 # Radii that are tried, over that of most points; and how far the edges of one frame may lie from those of all.
@@ -154,10 +154,9 @@ def _gradients(
     An edge of the container extends over its whole height, in front of the disc and of the wall. Patterns on the wall
     do not.
     """
-    in_camera = (points - [turntable.distance, 0.0, 0.0]) @ turntable.camera_rotation.T
-    normalised = in_camera[..., :2] / in_camera[..., 2:]
-    r2, (k1, k2) = (normalised**2).sum(axis=-1, keepdims=True), turntable.radial
-    pixels = turntable.focal_px * (1.0 + r2 * (k1 + k2 * r2)) * normalised + turntable.centre_px
+    unturned = replace(turntable, angles_rad=np.zeros(1), motion=None)
+    every = points.reshape(-1, 3)
+    pixels = project(unturned, np.zeros(len(every), int), every).pixels.reshape(*points.shape[:-1], 2)
     x, y = (pixels[..., k].astype(np.float32).reshape(-1, points.shape[2]) - np.float32(0.5) for k in (0, 1))
     shown = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
     step_px = np.linalg.norm(np.diff(pixels, axis=2), axis=-1).mean()
