@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.ticker import LogLocator
-from rich.table import Table
 
 from hsi_sc_nerf.benchmark.run import BenchmarkRun
 from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.models.schedule import Clock
 from hsi_sc_nerf.plotting import COLOURS, STYLE, logarithmic_axis, new_figure, save_figure
-from hsi_sc_nerf.terminal import markdown_table, screen_table
+from hsi_sc_nerf.terminal import markdown_table
 
 _COLUMNS = {
     "configuration": "{name}",
@@ -56,11 +55,6 @@ def table(runs: Sequence[BenchmarkRun]) -> tuple[list[str], list[list[str]]]:
         for end in run.stage_ends
     ]
     return list(columns), rows
-
-
-def results_table(runs: Sequence[BenchmarkRun]) -> Table:
-    """The table for a terminal."""
-    return screen_table(*table(runs), title="Held-out views, masked to the object, at the end of each stage")
 
 
 def write_csv(path: Path, runs: Sequence[BenchmarkRun]) -> None:

@@ -33,6 +33,7 @@ from hsi_sc_nerf.files import TEMPORARY_PREFIX, content_of, make_folder, read_js
 from hsi_sc_nerf.models.schedule import Clock
 from hsi_sc_nerf.packed.dataset import TRANSFORMS_NAME, open_packed
 from hsi_sc_nerf.settings_file import between, check_options
+from hsi_sc_nerf.terminal import screen_table
 
 
 @dataclass(frozen=True)
@@ -77,12 +78,13 @@ class BenchmarkCommand:
             InputError: a name, a word, a number or the data cannot be used, or a run failed.
         """
         chosen = [*map(named_configuration, self.configurations), *map(own_configuration, self.sets)]
-        from hsi_sc_nerf.benchmark.results import TABLE_WIDTH, results_table
+        from hsi_sc_nerf.benchmark.results import TABLE_WIDTH, table
 
-        runs = train_all(chosen, self)
+        header, rows = table(train_all(chosen, self))
         console = Console()
         console.width = max(console.width, TABLE_WIDTH)
-        console.print(results_table(runs))
+        title = "Held-out views, masked to the object, at the end of each stage"
+        console.print(screen_table(header, rows, title))
         console.print(f"Everything, and the picture: {escape(str(self.output_dir / 'benchmark.md'))}", soft_wrap=True)
 
 
@@ -98,10 +100,8 @@ def train_all(configurations: Sequence[Configuration], command: BenchmarkCommand
     machine = describe_machine()
     identity = {"machine": machine, "data_sha256": _data_sha256(data)}
     jobs = {configuration.name: _job(configuration, command, data) for configuration in configurations}
-    contents = {
-        name: _finished(command.output_dir / name / "result.json", job, identity) for name, job in jobs.items()
-    }
-    missing = [name for name, content in contents.items() if content is None]
+    runs = {name: _finished(command.output_dir / name, job, identity) for name, job in jobs.items()}
+    missing = [name for name, run in runs.items() if run is None]
     if len(missing) < len(jobs):
         console.print(f"Already trained: {', '.join(name for name in jobs if name not in missing)}")
     failures: list[str] = []
@@ -111,22 +111,18 @@ def train_all(configurations: Sequence[Configuration], command: BenchmarkCommand
         left = f", about {minutes:.0f} min left in all" if number else ""
         console.print(f"[bold]{number + 1}/{len(missing)} {name}[/bold] ({jobs[name].method}{left})")
         try:
-            contents[name] = _train(command.output_dir / name, jobs[name], identity)
+            runs[name] = _train(command.output_dir / name, jobs[name], identity)
         except InputError as error:
             failures.append(str(error))
             console.print(f"[yellow]{escape(str(error))}")
         else:
-            _write(_runs(jobs, contents), command, machine)
+            _write([run for run in runs.values() if run], command, machine)
+    finished = [run for run in runs.values() if run]
     if not missing:
-        _write(_runs(jobs, contents), command, machine)
+        _write(finished, command, machine)
     if failures:
         raise InputError(f"{len(failures)} of {len(jobs)} configurations failed; the first: {failures[0]}")
-    return _runs(jobs, contents)
-
-
-def _runs(jobs: dict[str, Job], contents: dict[str, dict[str, Any] | None]) -> list[BenchmarkRun]:
-    """Those that are finished."""
-    return [_run_of(name, job, content) for name, job in jobs.items() if (content := contents[name]) is not None]
+    return finished
 
 
 def _run_of(name: str, job: Job, content: dict[str, Any]) -> BenchmarkRun:
@@ -184,7 +180,7 @@ def _job(configuration: Configuration, command: BenchmarkCommand, data: Path) ->
     )
 
 
-def _train(folder: Path, job: Job, identity: dict[str, Any]) -> dict[str, Any]:
+def _train(folder: Path, job: Job, identity: dict[str, Any]) -> BenchmarkRun:
     """Train in a process of its own; the result is kept as ``result.json`` with its job."""
     log = folder.parent / "logs" / f"{folder.name}.log"
     for needed in (folder, log.parent):
@@ -197,11 +193,12 @@ def _train(folder: Path, job: Job, identity: dict[str, Any]) -> dict[str, Any]:
         run_step(f"training of {folder.name}", [sys.executable, "-m", module, str(job_path), str(found_path)], log)
         found = json.loads(found_path.read_text(encoding="utf-8"))
     write_json(folder / "result.json", {"job": asdict(job), **identity, **found})
-    return found
+    return _run_of(folder.name, job, found)
 
 
-def _finished(path: Path, job: Job, identity: dict[str, Any]) -> dict[str, Any] | None:
+def _finished(folder: Path, job: Job, identity: dict[str, Any]) -> BenchmarkRun | None:
     """Result of an earlier call for the same job, machine and data; None if there is none."""
+    path = folder / "result.json"
     if not path.is_file():
         return None
     again = "delete it to measure again"
@@ -210,8 +207,7 @@ def _finished(path: Path, job: Job, identity: dict[str, Any]) -> dict[str, Any] 
     if not expected.items() <= content.items():
         return None
     with content_of(path, "result", again):
-        _run_of("", job, content)
-    return content
+        return _run_of(folder.name, job, content)
 
 
 def _write(runs: Sequence[BenchmarkRun], command: BenchmarkCommand, machine: dict[str, str]) -> None:

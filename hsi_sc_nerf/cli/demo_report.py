@@ -18,7 +18,6 @@ from matplotlib.lines import Line2D
 from PIL import Image
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf import __version__, paper
@@ -32,6 +31,7 @@ from hsi_sc_nerf.packed.dataset import PackedDataset, open_packed
 from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure, show_image
 from hsi_sc_nerf.simulate.scores import ProcessingScore, score_processing
 from hsi_sc_nerf.simulate.truth import load_truth
+from hsi_sc_nerf.terminal import screen_table
 
 SPECTRAL_METRICS = ("sam", "rmse", "ssim", "psnr")
 REFERENCE_POINTS = 100_000
@@ -81,31 +81,29 @@ def show_table(
     console: Console, out: Path, metrics: dict[str, float], processing: ProcessingScore, costs: Sequence[StepCost]
 ) -> None:
     """Print metrics, errors and costs."""
-    quality = Table(
-        *("metric", "mean ± SD", "paper's apple"),
-        title="Held-out views, masked to the object; cloud against the true mesh",
-    )
-    units = {"sam": "SAM, rad", "rmse": "RMSE", "ssim": "SSIM", "psnr": "PSNR, dB", "f_score": "F-score at 2 mm, %"}
-    for key, title in units.items():
+    titles = {"sam": "SAM, rad", "rmse": "RMSE", "ssim": "SSIM", "psnr": "PSNR, dB", "f_score": "F-score at 2 mm, %"}
+    quality = []
+    for key, title in titles.items():
         digits = 1 if key in ("psnr", "f_score") else 4
         published = f"{PAPER_APPLE[key]:.{digits}f}" if key in PAPER_APPLE else "-"
         spread = f" ± {metrics[f'{key}_std']:.{digits}f}" if f"{key}_std" in metrics else ""
-        quality.add_row(title, f"{metrics[key]:.{digits}f}{spread}", published)
-    errors_table = Table("error", "value", "target", title="Processing against the truth")
-    for row in (
-        ("rotation, degrees (largest)", f"{processing.rotation_deg:.3f}", "0.5"),
-        ("position, mm (largest)", f"{1000 * processing.position_m:.2f}", "1"),
-        ("focal length, %", f"{processing.focal_length_percent:.2f}", "-"),
-        ("reflectance, RMSE", f"{processing.reflectance_rmse:.4f}", "0.02"),
-        ("values flagged, %", f"{100 * processing.flagged_fraction:.2f}", "-"),
-        ("mask, IoU (smallest)", f"{processing.mask_iou:.3f}", "-"),
-    ):
-        errors_table.add_row(*row)
-    cost_table = Table("step", "seconds", "peak memory, MiB", title="Cost")
-    for cost in costs:
-        cost_table.add_row(cost.name, f"{cost.seconds:.1f}", f"{cost.peak_memory_mib:.0f}")
-    cost_table.add_row("all", f"{sum(cost.seconds for cost in costs):.1f}", "")
-    console.print(quality, errors_table, cost_table)
+        quality.append([title, f"{metrics[key]:.{digits}f}{spread}", published])
+    errors = [
+        ["rotation, degrees (largest)", f"{processing.rotation_deg:.3f}", "0.5"],
+        ["position, mm (largest)", f"{1000 * processing.position_m:.2f}", "1"],
+        ["focal length, %", f"{processing.focal_length_percent:.2f}", "-"],
+        ["reflectance, RMSE", f"{processing.reflectance_rmse:.4f}", "0.02"],
+        ["values flagged, %", f"{100 * processing.flagged_fraction:.2f}", "-"],
+        ["mask, IoU (smallest)", f"{processing.mask_iou:.3f}", "-"],
+    ]
+    steps = [[cost.name, f"{cost.seconds:.1f}", f"{cost.peak_memory_mib:.0f}"] for cost in costs]
+    steps.append(["all", f"{sum(cost.seconds for cost in costs):.1f}", ""])
+    judged = "Held-out views, masked to the object; cloud against the true mesh"
+    console.print(
+        screen_table(["metric", "mean ± SD", "paper's apple"], quality, judged),
+        screen_table(["error", "value", "target"], errors, "Processing against the truth"),
+        screen_table(["step", "seconds", "peak memory, MiB"], steps, "Cost"),
+    )
     console.print(f"Pictures, cloud and summary.json are in {escape(str(out))}.")
 
 
