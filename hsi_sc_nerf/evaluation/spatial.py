@@ -78,16 +78,6 @@ def sample_surface(
     return corners[chosen, 0] + root * ((1 - along) * edges[chosen, 0] + along * edges[chosen, 1])
 
 
-def distance_to_surface(
-    points_m: Float[np.ndarray, "n 3"], vertices_m: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]
-) -> Float[np.ndarray, "n"]:
-    """Unsigned distance of each point to the nearest point of a triangle mesh, metres (Open3D, float32)."""
-    # Single precision tells places of a survey's grid, thousands of kilometres from its origin, only 0.5 m apart.
-    centre_m = np.mean(vertices_m, axis=0)
-    scene = ray_scene(vertices_m - centre_m, triangles)
-    return scene.compute_distance(np.asarray(points_m - centre_m, np.float32)).numpy()
-
-
 @dataclass(frozen=True)
 class Surface:
     """Points, and the surface they were sampled from where there is one; metres."""
@@ -97,10 +87,13 @@ class Surface:
     triangles: Int[np.ndarray, "t 3"] | None = None
 
     def distances_m(self, points_m: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k"]:
-        """Distance of each given point to the surface, or to the nearest point where there is none."""
+        """Distance of each given point to the surface (Open3D), or to the nearest point where there is none."""
         if self.vertices_m is None or self.triangles is None:
             return cKDTree(self.points_m).query(points_m, workers=-1)[0]
-        return distance_to_surface(points_m, self.vertices_m, self.triangles).astype(float)
+        # Single precision tells places of a survey's grid, thousands of kilometres from its origin, only 0.5 m apart.
+        centre_m = np.mean(self.vertices_m, axis=0)
+        scene = ray_scene(self.vertices_m - centre_m, self.triangles)
+        return scene.compute_distance(np.asarray(points_m - centre_m, np.float32)).numpy().astype(float)
 
 
 @dataclass(frozen=True)

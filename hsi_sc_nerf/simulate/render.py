@@ -16,6 +16,7 @@ from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene, rays_for_scene, unocclude
 from hsi_sc_nerf.simulate.mesh import subdivided
 
 RAYS_AT_ONCE = 2**19
+"""Of a camera, about; more take more memory."""
 RAY_START_M = 2e-5
 """Offset of a ray's origin from the surface that it leaves, so that it does not hit that surface."""
 WEIGHT_STEPS = 2048
@@ -136,10 +137,7 @@ class Renderer:
         materials: material of each column of the weights; extra materials and then the chamber come last.
         vertices, triangles, weights: of all parts, concatenated.
         is_object: which triangles belong to the scanned object.
-        rays_at_once: of a camera, about; more take more memory.
     """
-
-    rays_at_once = RAYS_AT_ONCE
 
     def __init__(self, parts: Sequence[Part], extra_materials: Sequence[str] = ()) -> None:
         names = dict.fromkeys([name for part in parts for name in part.materials] + list(extra_materials))
@@ -172,7 +170,7 @@ class Renderer:
         lens: Lens | None = None,
     ) -> Iterator[tuple[slice, Hits]]:
         """Hits of the rays of a camera, a block of image lines at a time, which bounds the memory."""
-        lines = max(1, self.rays_at_once // (intrinsics.w * supersampling**2))
+        lines = max(1, RAYS_AT_ONCE // (intrinsics.w * supersampling**2))
         for first in range(0, intrinsics.h, lines):
             rows = slice(first, min(first + lines, intrinsics.h))
             directions = _camera_rays(intrinsics, rows.start, rows.stop, supersampling, lens)

@@ -12,7 +12,6 @@ from hsi_sc_nerf.evaluation.spatial import (
     ThresholdCurves,
     best_threshold_m,
     distance_statistics,
-    distance_to_surface,
     precision_recall_f_score,
     sample_surface,
     score_at,
@@ -87,7 +86,7 @@ def test_a_mesh_without_area_is_refused() -> None:
 @pytest.mark.parametrize("origin_m", [(0.0, 0.0, 0.0), (4.5e5, 5.2e6, 120.0)], ids=["object", "survey grid"])
 def test_distance_to_the_surface_not_to_its_vertices(origin_m: tuple[float, ...]) -> None:
     points = np.array([[0.05, 0.05, 0.003], [0.05, 0.05, -0.003], [0.05, 0.02, 0.0], [0.13, 0.05, 0.04]])
-    distances = distance_to_surface(points + origin_m, SQUARE + origin_m, TRIANGLES)
+    distances = Surface(SQUARE + origin_m, SQUARE + origin_m, TRIANGLES).distances_m(points + origin_m)
     np.testing.assert_allclose(distances, [0.003, 0.003, 0.0, 0.05], atol=1e-8)
 
 

@@ -166,12 +166,12 @@ def test_a_sphere_covers_the_solid_angle_of_its_closed_form():
     assert coverage.sum() == pytest.approx(np.pi * radius_px**2, rel=2e-3)
 
 
-def test_rendering_in_pieces_changes_nothing():
+def test_rendering_in_pieces_changes_nothing(monkeypatch):
     scene = override(load_scene("maize"), size_px=32)
     renderer = assemble.build_renderer(scene, assemble.object_part(scene))
     arguments = assemble.intrinsics(scene.camera), assemble.frame_plan(scene).camera_to_world[3], 2
     whole = render(renderer, *arguments)
-    renderer.rays_at_once = 700
+    monkeypatch.setattr("hsi_sc_nerf.simulate.render.RAYS_AT_ONCE", 700)
     pieces = render(renderer, *arguments)
     np.testing.assert_array_equal(whole.material_weights, pieces.material_weights)
     np.testing.assert_array_equal(whole.coverage, pieces.coverage)
