@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from hsi_sc_nerf.analysis.closed_mesh import thinned
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import SpectralCloud
+from hsi_sc_nerf.geometry.camera import unit_vectors
 
 SPACINGS_M = (0.005, 0.002)
 """Spacings of the coarse sample, from which the search starts, and of the fine one."""
@@ -54,7 +55,7 @@ def surface_samples(
     Raises:
         InputError: an object is too small, or a cloud has too few points.
     """
-    units = [unit_spectra(some) for some in spectra]
+    units = [unit_vectors(some) for some in spectra]
     every = np.concatenate([one[:: max(1, len(one) // _DRAWN)] for one in units])
     axes = np.linalg.svd(every - every.mean(axis=0), full_matrices=False)[2][: min(COMPONENTS, every.shape[1] - 1)]
     samples = []
@@ -81,14 +82,7 @@ def surface_gradients(
     return np.einsum("njk,nkf->nfj", inverse, values[near[:, 1:]] - values[:, None])
 
 
-def unit_spectra(spectra: Float[np.ndarray, "n bands"]) -> Float[np.ndarray, "n bands"]:
-    """Spectra scaled to unit length: their shape without their brightness."""
-    return spectra / np.maximum(np.linalg.norm(spectra, axis=1, keepdims=True), 1e-12)
-
-
 def _thinned(cloud: SpectralCloud, features: Float[np.ndarray, "n f"], spacing_m: float) -> SurfaceSample:
     """One point for each cube: the mean of its points."""
     points, rest = thinned(cloud.points, np.column_stack([cloud.normals, features]), spacing_m)
-    mean = np.column_stack([points, rest])
-    normals = mean[:, 3:6] / np.maximum(np.linalg.norm(mean[:, 3:6], axis=1, keepdims=True), 1e-12)
-    return SurfaceSample(mean[:, :3], normals, mean[:, 6:])
+    return SurfaceSample(points, unit_vectors(rest[:, :3]), rest[:, 3:])

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.analysis.change_days import Day
-from hsi_sc_nerf.analysis.change_features import COMPONENTS, surface_gradients, unit_spectra
+from hsi_sc_nerf.analysis.change_features import COMPONENTS, surface_gradients
 from hsi_sc_nerf.analysis.change_regions import OUTSIDE, ChangedRegion, changed_regions, limit_of_blank_m2
 from hsi_sc_nerf.analysis.change_significance import (
     FALSE_DISCOVERIES,
@@ -20,6 +20,7 @@ from hsi_sc_nerf.analysis.change_significance import (
 )
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.registration import robust_radius
+from hsi_sc_nerf.geometry.camera import unit_vectors
 from hsi_sc_nerf.indices.formula import SpectralIndex, index_values
 from hsi_sc_nerf.spectra import require_bands
 
@@ -152,9 +153,9 @@ def changes(
 
     found: dict[str, Quantity] = {}
     if len(one.wavelengths_nm) > 1:
-        units = [unit_spectra(day.surface.spectra) for day in days]
+        units = [unit_vectors(day.surface.spectra) for day in days]
         axes = _axes((units[1] - units[0])[seen])
-        shared = unit_spectra(typical * (1.0 + modes)) - unit_spectra(typical)
+        shared = unit_vectors(typical * (1.0 + modes)) - unit_vectors(typical)
         angle = 2.0 * np.arcsin(np.clip(np.linalg.norm(units[1] - units[0], axis=1) / 2.0, 0.0, 1.0))
         found[SPECTRUM] = tested(
             SPECTRUM, "rad", [each @ axes.T for each in units], np.linalg.norm(shared @ axes.T, axis=0), angle

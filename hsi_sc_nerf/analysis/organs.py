@@ -12,9 +12,9 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from hsi_sc_nerf.analysis.change_features import unit_spectra
 from hsi_sc_nerf.analysis.spectral_edges import GAP, LARGEST, LEAST_POINTS, Edge, beside, rings, sharpest_edge
 from hsi_sc_nerf.analysis.spectral_mesh import NEIGHBOURS
+from hsi_sc_nerf.geometry.camera import unit_vectors
 from hsi_sc_nerf.processing.spectral_subspace import MIN_SPECTRA, find_subspace
 
 BODY, STEM, CALYX, LEAF, HUSK, KERNELS = "body", "stem", "calyx", "leaf", "husk", "kernels"
@@ -78,7 +78,7 @@ def propose_organs(
         return {BODY: rest}
     near = cKDTree(points_m).query(points_m, NEIGHBOURS + 1)[1]
     # Spectra without their brightness, in as few coordinates as they support.
-    shapes = unit_spectra(spectra[near].mean(axis=1, dtype=float))
+    shapes = unit_vectors(spectra[near].mean(axis=1, dtype=float))
     surface = _Surface(points_m, shapes @ find_subspace(shapes[:: max(1, len(shapes) // _SAMPLE)]).basis, near)
     for search in _SEARCHES:
         organs = 0

@@ -16,6 +16,7 @@ from hsi_sc_nerf.analysis.calibrations import Calibration
 from hsi_sc_nerf.analysis.class_maps import most_probable, rest_words
 from hsi_sc_nerf.analysis.classes import UNCLASSIFIED, class_areas_m2
 from hsi_sc_nerf.export.cloud import SpectralCloud, band_property_names, material_spectra
+from hsi_sc_nerf.geometry.camera import unit_vectors
 from hsi_sc_nerf.indices.catalogue import find_indices
 from hsi_sc_nerf.indices.formula import index_values
 from hsi_sc_nerf.plotting import INDEX_COLOURS, usual_range
@@ -162,7 +163,6 @@ def cloud_payload(
     low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
     centre, reach_m = (low + high) / 2.0, max(float((high - low).max()) / 2.0, 1e-9)
     areas_m2 = point_areas_m2(cloud.points)
-    lengths = np.maximum(np.linalg.norm(cloud.normals, axis=1, keepdims=True), 1e-12)
     nm, material = cloud.wavelengths_nm, material_spectra(cloud)
     analysed, of_what = (cloud.spectra, "") if material is None else (material, ", of the material")
     calibrated = [(one, one.predictions(analysed, nm, only_inside=True)) for one in calibrations]
@@ -180,7 +180,7 @@ def cloud_payload(
         "spacing": float(np.sqrt(np.median(areas_m2))) / reach_m,
         "areas_cm2": _scalar("", "", 1e4 * areas_m2, None),
         "positions": _base64(np.rint((cloud.points - centre) / reach_m * _INT16).astype(np.int16)),
-        "normals": _base64(np.rint(cloud.normals / lengths * 127.0).astype(np.int8)),
+        "normals": _base64(np.rint(unit_vectors(cloud.normals) * 127.0).astype(np.int8)),
         "wavelengths_nm": cloud.wavelengths_nm[order].tolist(),
         "mean": spectra.mean[order].tolist(),
         "rank": len(spectra.basis),
