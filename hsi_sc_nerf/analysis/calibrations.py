@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,6 +19,7 @@ from hsi_sc_nerf.analysis.maps import SurfaceMap
 from hsi_sc_nerf.analysis.preprocessing import Step, preprocessed, read_steps
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.findings import names_in_short
 from hsi_sc_nerf.number_table import keyed, number_in, numbers_in, read_number_table
 from hsi_sc_nerf.spectra import nearest_bands
 
@@ -33,7 +34,6 @@ _INTERCEPTS = ("b0", "intercept", "(intercept)")
 _SAME_BAND_NM = 0.05
 """Tables round wavelengths."""
 _CHUNK_SPECTRA = 1 << 13
-_MOST_LISTED = 6
 _FATAL = 4  # of onnxruntime's levels; it logs past Python, beside our sentences
 _REMEDY = "docs/how-to/calibrations.md shows such a table"
 
@@ -206,7 +206,7 @@ def read_calibration(path: Path | str) -> Calibration:
         if unknown := head.keys() - _KEYS:
             raise ValueError(f"{', '.join(sorted(unknown))} is no known key; known are {', '.join(sorted(_KEYS))}")
         if "wavelength_nm" not in columns:
-            raise ValueError(f"it needs a column wavelength_nm and has {_listed(columns)}")
+            raise ValueError(f"it needs a column wavelength_nm and has {names_in_short([*columns]) or 'none'}")
         nm = columns.pop("wavelength_nm")
         if not (len(nm) and np.isfinite(nm).all() and (np.diff(nm) > 0).all()):
             raise ValueError("its column wavelength_nm needs a number in each line, in ascending order")
@@ -239,7 +239,8 @@ def read_calibration(path: Path | str) -> Calibration:
             return spectra @ slopes[:, None] + intercept
     else:
         raise InputError(
-            f"{path}: has neither a column coefficient nor a '# model:', but {_listed(columns)}; {_REMEDY}."
+            f"{path}: has neither a column coefficient nor a '# model:', but {names_in_short([*columns]) or 'none'}; "
+            f"{_REMEDY}."
         )
     name, unit = head.get("name", path.stem), head.get("unit", "")
     return Calibration(name, unit, numbers["error"], nm, steps, used, reference, predict, domain, classes)
@@ -264,12 +265,6 @@ def _read_table(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
         head["intercept"] = str(columns["coefficient"][0])
         columns = {name: column[1:] for name, column in columns.items()}
     return head, columns
-
-
-def _listed(columns: Collection[str]) -> str:
-    """Names of columns in a sentence, the first few of many."""
-    shown = ", ".join(list(columns)[:_MOST_LISTED])
-    return f"{shown}, ..." if len(columns) > _MOST_LISTED else shown or "none"
 
 
 def _domain(head: dict[str, str], columns: dict[str, np.ndarray]) -> Domain | None:

@@ -17,6 +17,7 @@ from hsi_sc_nerf.analysis.change_days import Day
 from hsi_sc_nerf.analysis.change_maps import SPECTRUM, SURFACE
 from hsi_sc_nerf.analysis.report import CM2_PER_M2
 from hsi_sc_nerf.analysis.spectral_mesh import write_spectral_mesh
+from hsi_sc_nerf.analysis.traits import WHOLE
 from hsi_sc_nerf.files import atomic_write, nan_to_none, write_json
 from hsi_sc_nerf.terminal import markdown_table, markdown_text
 
@@ -25,7 +26,6 @@ COLUMNS = (
     *("area_before_cm2", "area_after_cm2", "area_change_cm2", "area_change_sd_cm2", "x_mm", "y_mm", "z_mm"),
 )
 """Columns of change.csv."""
-WHOLE = "whole surface"
 CHANGED, UNDECIDED = "change", "undecided"
 """Kinds of rows: regions that count, and those up to the limit of blank."""
 _PAGE_REGIONS = 12

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
@@ -13,13 +12,13 @@ from jaxtyping import Float
 
 from hsi_sc_nerf.analysis import pictures, report
 from hsi_sc_nerf.analysis.class_maps import ClassMap, rest_words
-from hsi_sc_nerf.analysis.library import write_library
+from hsi_sc_nerf.analysis.library import SpectralLibrary, write_library
 from hsi_sc_nerf.analysis.maps import SurfaceMap, numbered
 from hsi_sc_nerf.analysis.measurement import Measurement
 from hsi_sc_nerf.analysis.spectral_mesh import write_spectral_mesh
 from hsi_sc_nerf.analysis.traits import Traits
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import atomic_write, write_json
+from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.spectra import available_composites
 
 _PICTURES = (
@@ -147,7 +146,4 @@ def write_spectra(path: Path, wavelengths_nm: Float[np.ndarray, "bands"], traits
         for kind, spectrum in kinds.items():
             titles += [f"{region.name}{kind} mean", f"{region.name}{kind} SD"]
             columns += [spectrum.mean, spectrum.sd]
-    with atomic_write(path) as (temporary,), temporary.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["wavelength_nm", *titles])
-        writer.writerows([f"{number:.6g}" for number in row] for row in zip(wavelengths_nm, *columns, strict=True))
+    write_library(path, SpectralLibrary(tuple(titles), wavelengths_nm, np.stack(columns)))
