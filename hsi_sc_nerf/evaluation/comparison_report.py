@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from matplotlib import colormaps, rc_context
 from plyfile import PlyData
 
@@ -112,7 +112,8 @@ def write_comparison(folder: Path, comparison: Comparison, cloud_name: str, refe
         InputError: the operating system refused to write.
     """
     names = ("comparison.md", "comparison.json", "curves.png", "distances.png", "distances.ply")
-    limit_m = _colour_limit_m(comparison.to_reference_m, comparison.to_cloud_m)
+    # Colours end at the larger 95th percentile, so that outliers do not darken the rest.
+    limit_m = max(float(np.percentile(m, 95)) for m in (comparison.to_reference_m, comparison.to_cloud_m)) or 1e-6
     figures = comparison_summary(comparison)
     with atomic_write(*(folder / name for name in names)) as (page, numbers, curves, pictures, cloud):
         write_json(numbers, {"cloud": cloud_name, "reference": reference_name, **figures})
@@ -135,8 +136,9 @@ def _write_distance_ply(
     path: Path, points_m: Float[np.ndarray, "n 3"], distances_m: Float[np.ndarray, "n"], limit_m: float
 ) -> None:
     """Points with their distance as colour and as ``scalar_distance_m``, a scalar field in CloudCompare."""
+    colours = colormaps[INDEX_COLOURS](np.clip(distances_m / limit_m, 0, 1), bytes=True)[:, :3]
     columns = dict(zip("xyz", points_m.T.astype(np.float32), strict=True))
-    columns |= dict(zip(("red", "green", "blue"), _distance_colours(distances_m, limit_m).T, strict=True))
+    columns |= dict(zip(("red", "green", "blue"), colours.T, strict=True))
     columns["scalar_distance_m"] = distances_m.astype(np.float32)
     PlyData([ply_vertices(columns)], byte_order="<").write(str(path))
 
@@ -205,16 +207,6 @@ def _seen_sentence(comparison: Comparison) -> str:
         f" Recall counts the {100 * comparison.seen_fraction:.1f} % of the true surface that some view sees; "
         "distances of the cloud are to all of it."
     )
-
-
-def _colour_limit_m(*distances_m: Float[np.ndarray, "n"]) -> float:
-    """Upper end of the colour scale: the largest 95th percentile, so that outliers do not darken the rest."""
-    return max(float(np.percentile(distances, 95)) for distances in distances_m) or 1e-6
-
-
-def _distance_colours(distances_m: Float[np.ndarray, "n"], limit_m: float) -> UInt8[np.ndarray, "n 3"]:
-    """Dark blue at 0 to yellow at the limit and beyond (viridis)."""
-    return colormaps[INDEX_COLOURS](np.clip(distances_m / limit_m, 0, 1), bytes=True)[:, :3]
 
 
 @rc_context(STYLE)
