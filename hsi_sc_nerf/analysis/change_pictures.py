@@ -19,16 +19,16 @@ from hsi_sc_nerf.analysis.change_significance import FALSE_DISCOVERIES
 from hsi_sc_nerf.analysis.classes import UNCLASSIFIED
 from hsi_sc_nerf.analysis.pictures import (
     GREY,
-    SIDES_DEG,
     SideViews,
     class_key,
     draw_rows,
     in_legend,
     paint_classes,
     paint_values,
+    show_rows,
 )
 from hsi_sc_nerf.files import atomic_write
-from hsi_sc_nerf.plotting import ANGLE_COLOURS, INDEX_COLOURS, STYLE, new_figure, show_image
+from hsi_sc_nerf.plotting import ANGLE_COLOURS, INDEX_COLOURS, STYLE, new_figure
 from hsi_sc_nerf.rendering.pictures import open_video
 from hsi_sc_nerf.spectra import nearest_bands
 
@@ -92,12 +92,12 @@ def write_film(path: Path, first: Day, comparisons: Sequence[DayComparison], vie
     """
     last = comparisons[-1].quantities[shown]
     scale = _scale(last)
-    stills = [_frame(first.name, first, first, paint_values(0.0 * last.change, *scale), views, shown)]
+    stills = [_frame(first, first, paint_values(0.0 * last.change, *scale), views, shown)]
     for one in comparisons:
         changed = one.quantities[shown]
         # 0 where nothing is significant, and NaN where nothing is known.
         lit = paint_values(changed.change * (changed.p < FALSE_DISCOVERIES), *scale)
-        stills.append(_frame(one.after.name, one.after, first, lit, views, shown, changed.undecided))
+        stills.append(_frame(one.after, first, lit, views, shown, changed.undecided))
     with atomic_write(path) as (temporary,), open_video(temporary, _FRAMES_PER_SECOND) as add_frame:
         for before, after in pairwise([*stills, stills[-1]]):
             for _ in range(_HELD_FRAMES):
@@ -107,7 +107,6 @@ def write_film(path: Path, first: Day, comparisons: Sequence[DayComparison], vie
 
 
 def _frame(
-    name: str,
     day: Day,
     first: Day,
     change: Float[np.ndarray, "v 3"],
@@ -116,17 +115,9 @@ def _frame(
     undecided: Bool[np.ndarray, "v"] | None = None,
 ) -> UInt8[np.ndarray, "h w 3"]:
     figure = new_figure(7.5, 4.2)
-    figure.suptitle(name)
-    grid = figure.subplots(2, len(SIDES_DEG))
-    for line, label, pictures in zip(
-        grid,
-        ("pseudo-RGB", f"{shown}\nsince {first.name}"),
-        (views.on_white(_natural(day, first)), views.on_white(change, undecided)),
-        strict=True,
-    ):
-        for axes, picture in zip(line, pictures, strict=True):
-            show_image(axes, picture)
-        line[0].set_ylabel(label)
+    figure.suptitle(day.name)
+    natural, changed = views.on_white(_natural(day, first)), views.on_white(change, undecided)
+    show_rows(figure, {"pseudo-RGB": natural, f"{shown}\nsince {first.name}": changed})
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from matplotlib import colormaps, rc_context
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, to_rgb
+from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from hsi_sc_nerf.analysis.class_maps import OUTSIDE, WITHOUT_LIMITS
@@ -131,11 +132,7 @@ def draw_rows(
     width_in = 1.75
     row_in = max(width_in * first.shape[0] / first.shape[1], _LABEL_IN)
     figure = new_figure(width_in * len(SIDES_DEG) + 1.0, row_in * len(rows) + 0.35)
-    grid = figure.subplots(len(rows), len(SIDES_DEG), squeeze=False)
-    for line, (label, pictures) in zip(grid, rows.items(), strict=True):
-        for axes, picture in zip(line, pictures, strict=True):
-            show_image(axes, picture)
-        line[0].set_ylabel(label)
+    grid = show_rows(figure, rows)
     for axes, title in zip(grid[0], SIDES_DEG, strict=True):
         axes.set_title(title)
     for line, scale in zip(grid, scales, strict=False):
@@ -146,6 +143,16 @@ def draw_rows(
     if key:
         figure.legend(handles=list(key), loc="outside lower center", fontsize=8)
     save_figure(figure, path)
+
+
+def show_rows(figure: Figure, rows: Mapping[str, Sequence[np.ndarray]]) -> np.ndarray:
+    """Show pictures of the four sides in labelled rows of a figure, and return their axes."""
+    grid = figure.subplots(len(rows), len(SIDES_DEG), squeeze=False)
+    for line, (label, pictures) in zip(grid, rows.items(), strict=True):
+        for axes, picture in zip(line, pictures, strict=True):
+            show_image(axes, picture)
+        line[0].set_ylabel(label)
+    return grid
 
 
 @rc_context(STYLE)

@@ -13,7 +13,7 @@ from markupsafe import Markup
 from hsi_sc_nerf.files import content_of
 from hsi_sc_nerf.findings import EFFECT_COLUMNS, Finding, effect_rows, judged
 from hsi_sc_nerf.packed.dataset import PackedDataset
-from hsi_sc_nerf.poses.report import angle_words
+from hsi_sc_nerf.poses.report import REPROJECTION_TARGET_PX, angle_words
 from hsi_sc_nerf.poses.result import is_full_turn
 from hsi_sc_nerf.report.charts import Curve, line_chart
 from hsi_sc_nerf.report.page import (
@@ -39,8 +39,6 @@ _FLAGGED = {
 _FLAGGED_FRACTION = (0.01, 0.05)
 # The outline of a convex object changes by a few per cent from frame to frame.
 _MASK_JUMP = 0.1
-# The paper's target.
-_REPROJECTION_PX = 1.0
 
 
 def inspection_section(dataset: PackedDataset) -> list[Section]:
@@ -258,7 +256,7 @@ def judge_poses(found: Mapping[str, Any]) -> list[Finding]:
     error, frames = (found.get(key) or {} for key in ("reprojection_error_px", "frames"))
     findings = []
     if error.get("overall") is not None:
-        target_px = error.get("target") or _REPROJECTION_PX
+        target_px = error.get("target") or REPROJECTION_TARGET_PX
         sentence = f"The reprojection error is {error['overall']:.2f} px (good up to {target_px:g} px)"
         advice = "look at the frames that stand out"
         findings.append(judged("reprojection", error["overall"], (target_px, np.inf), sentence, advice))
