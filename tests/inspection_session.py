@@ -47,6 +47,11 @@ def write_one(folder: Path, name: str, reflectance: np.ndarray, *, seed: int = 0
         )
 
 
+def write_white(folder: Path, reflectance: float, **fields) -> None:
+    """The tarp, evenly of one reflectance."""
+    write_one(folder, "white_reference", np.full((SIZE_PX, SIZE_PX, len(WAVELENGTHS_NM)), reflectance), **fields)
+
+
 def write_turntable(
     folder: Path, frames: int = 12, *, info: dict | None = None, quarter_turns: int = 0, clockwise: bool = False
 ) -> Path:
@@ -54,7 +59,7 @@ def write_turntable(
     pictures = rendered(frames)[:: -1 if clockwise else 1]
     for number, image in enumerate(pictures):
         write_one(folder, f"fruit_{number:02d}", np.rot90(image, quarter_turns))
-    write_one(folder, "white_reference", np.full((SIZE_PX, SIZE_PX, len(WAVELENGTHS_NM)), 0.98))
+    write_white(folder, 0.98)
     if info is not None:
         (folder / "session.json").write_text(json.dumps(info))
     return folder

@@ -100,14 +100,18 @@ def leave_gaps(cube: Cube, gap: float, dtype: str) -> None:
     missing = np.random.default_rng(counts.sum().astype(int)).random(counts.shape) < 5e-4
     missing[len(counts) // 2, 36] = missing[0, 3] = True
     counts[missing] = gap
-    ignored = {} if np.isnan(gap) else {"data ignore value": int(gap)}
+    rewrite(cube, counts, **({} if np.isnan(gap) else {"data ignore value": int(gap)}))
+
+
+def rewrite(cube: Cube, counts: np.ndarray, **fields) -> None:
+    """Write other counts in the place of a cube."""
     write_cube(
         cube.header_path,
         counts,
         wavelengths_nm=cube.wavelengths_nm,
         interleave=cube.interleave,
         data_suffix=cube.data_path.suffix,
-        extra_header={"tint": cube.integration_time_ms, **ignored},
+        extra_header={"tint": cube.integration_time_ms, **fields},
     )
 
 
@@ -143,10 +147,10 @@ def test_a_dark_of_one_line_states_the_uncertainty_of_many_or_none(tmp_path, whi
     session = open_session(simulate_session(scene, tmp_path / "session", progress=False))
     whole = calibrate_session(session, CalibrationConfig())
     for dark in {capture.dark for capture in session.captures}:
-        keep_lines(dark, slice(1))
+        rewrite(dark, dark.read()[:1])
     if white_lines is not None:
         x0, y0, x1, _ = whole.white.roi
-        keep_lines(session.white.cube, slice(y0, y0 + white_lines))
+        rewrite(session.white.cube, session.white.cube.read()[y0 : y0 + white_lines])
         roi = (x0, 0, x1, white_lines)
     single = calibrate_session(
         open_session(session.path), CalibrationConfig(roi=None if white_lines is None else roi)
@@ -160,18 +164,6 @@ def test_a_dark_of_one_line_states_the_uncertainty_of_many_or_none(tmp_path, whi
     assert (single.uncertainty.constant > 1.5 * whole.uncertainty.constant).all()
     ratio = single.uncertainty.standard_deviation(grey) / whole.uncertainty.standard_deviation(grey)
     assert ((ratio > 0.95) & (ratio < 1.5)).all()
-
-
-def keep_lines(cube: Cube, lines: slice) -> None:
-    """Write a cube again with some of its lines."""
-    write_cube(
-        cube.header_path,
-        cube.read()[lines],
-        wavelengths_nm=cube.wavelengths_nm,
-        interleave=cube.interleave,
-        data_suffix=cube.data_path.suffix,
-        extra_header={"tint": cube.integration_time_ms},
-    )
 
 
 def test_hot_elements_do_not_move_the_tarp(tmp_path):

@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from inspection_session import INFO, LAMP, SIZE_PX, WAVELENGTHS_NM, write_one
+from inspection_session import INFO, LAMP, WAVELENGTHS_NM, write_white
 
 from hsi_sc_nerf.capture.envi import open_cube, write_cube
 from hsi_sc_nerf.capture.session import open_session
@@ -18,10 +18,6 @@ PAPER = 0.76
 def paper(folder):
     (found,) = [f for f in inspect_session(open_session(folder)).findings if f.name == "paper"]
     return found
-
-
-def write_white(folder, reflectance, **fields):
-    write_one(folder, "white_reference", np.full((SIZE_PX, SIZE_PX, len(WAVELENGTHS_NM)), reflectance), **fields)
 
 
 def test_white_paper_is_green(session):

@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from inspection_session import INFO, SIZE_PX, WAVELENGTHS_NM, rendered, write_one
+from inspection_session import INFO, WAVELENGTHS_NM, rendered, write_white
 
 from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.capture.session import open_session
@@ -15,10 +15,6 @@ from hsi_sc_nerf.poses.marker_detection import detect_markers, marker_pattern
 
 WHITE = 0.98
 """Of the scene; what is as bright counts as 1."""
-
-
-def write_white(folder, reflectance, **fields):
-    write_one(folder, "white_reference", np.full((SIZE_PX, SIZE_PX, len(WAVELENGTHS_NM)), reflectance), **fields)
 
 
 def brightness(folder):
