@@ -42,13 +42,12 @@ FRAME = (
 )
 REFLECTANCE = ("1", "reflectance factor relative to the white reference in full light")
 MATERIAL = ("1", "reflectance factor of the material: as measured without gloss, over the irradiance in the band")
-_POSITION = ("m", "position in the object frame")
-_NORMAL = ("1", "outward unit normal")
-_COLOUR = ("1", "pseudo-RGB of the spectrum, 0 to 255")
+NORMALS = ("nx", "ny", "nz")
+COLOURS = ("red", "green", "blue")
 COLUMNS: dict[str, tuple[str, str]] = {
-    **dict.fromkeys("xyz", _POSITION),
-    **dict.fromkeys(("nx", "ny", "nz"), _NORMAL),
-    **dict.fromkeys(("red", "green", "blue"), _COLOUR),
+    **dict.fromkeys("xyz", ("m", "position in the object frame")),
+    **dict.fromkeys(NORMALS, ("1", "outward unit normal")),
+    **dict.fromkeys(COLOURS, ("1", "pseudo-RGB of the spectrum, 0 to 255")),
     "opacity": ("1", "opacity that the point's ray collects, 0 to 1"),
     "incidence_deg": ("degree", "angle between the normal and the ray that gave the spectrum"),
     "views": ("1", "number of training frames that see the point"),
@@ -61,9 +60,8 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "gloss": ("1", "what the skin mirrors, as reflectance, mean over bands"),
 }
 """CF unit and meaning of each column that this package writes, the bands' apart."""
-_GEOMETRY = ("x", "y", "z", "nx", "ny", "nz")
-_CHANNELS = ("red", "green", "blue")
-_MEASURED = {*COLUMNS} - {*_GEOMETRY, *_CHANNELS}
+_GEOMETRY = (*"xyz", *NORMALS)
+_MEASURED = {*COLUMNS} - {*_GEOMETRY, *COLOURS}
 _BAND_NAME = re.compile(r"scalar_(\d+(?:\.\d+)?)nm")
 _MATERIAL_NAME = re.compile(r"material_\d+(?:\.\d+)?nm")
 
@@ -225,10 +223,10 @@ def write_spectral_ply(
     if isinstance(cloud, SpectralCloud):
         cloud = stream(cloud)
     band_names = band_property_names(cloud.wavelengths_nm)
-    names = [*_GEOMETRY, *_CHANNELS, *band_names, *cloud.extra_names]
+    names = [*_GEOMETRY, *COLOURS, *band_names, *cloud.extra_names]
     if len(set(names)) != len(names) or any(len(name.split()) != 1 for name in cloud.extra_names):
         raise ValueError(f"extra columns need one-word names that are not taken: {list(cloud.extra_names)}")
-    properties = (f"property {'uchar' if name in _CHANNELS else 'float'} {name}" for name in names)
+    properties = (f"property {'uchar' if name in COLOURS else 'float'} {name}" for name in names)
     comments = (f"comment {line}" for line in comment_lines(names, cloud.run))
     header = ["ply", "format binary_little_endian 1.0", *comments, f"element vertex {cloud.count}", *properties]
     faces = np.empty(0 if triangles is None else len(triangles), [("count", "u1"), ("corners", "<i4", 3)])
@@ -275,10 +273,14 @@ def band_property_names(wavelengths_nm: Float[np.ndarray, "bands"], kind: str = 
 
 def material_spectra(cloud: SpectralCloud) -> Float[np.ndarray, "n bands"] | None:
     """Reflectance of the material, from the columns that `hsi-sc-nerf material` adds; None without all of them."""
-    names = band_property_names(cloud.wavelengths_nm, "material")
-    if not set(names) <= set(cloud.extra):
-        return None
-    return np.stack([cloud.extra[name] for name in names], axis=1)
+    names = material_names(cloud.wavelengths_nm, cloud.extra)
+    return np.stack([cloud.extra[name] for name in names], axis=1) if names else None
+
+
+def material_names(wavelengths_nm: Float[np.ndarray, "bands"], extra_names: Iterable[str]) -> list[str]:
+    """Names of the columns that hold the material's reflectance, one a band; none if any is missing."""
+    names = band_property_names(wavelengths_nm, "material")
+    return names if set(names) <= set(extra_names) else []
 
 
 def own_name(name: str) -> str:
@@ -308,7 +310,7 @@ def read_spectral_ply(path: Path | str) -> SpectralCloud:
     vertices = read_ply(path)["vertex"].data
     names = vertices.dtype.names
     bands = {name: float(match[1]) for name in names if (match := _BAND_NAME.fullmatch(name))}
-    missing = [name for name in (*_GEOMETRY, *_CHANNELS) if name not in names]
+    missing = [name for name in (*_GEOMETRY, *COLOURS) if name not in names]
     if missing or not bands:
         lacking = ", ".join(missing) or "spectral bands (scalar_...nm)"
         raise InputError(f"{path}: has no {lacking}; give a cloud that ns-export wrote from an hsi-sc-nerf run.")
@@ -318,14 +320,14 @@ def read_spectral_ply(path: Path | str) -> SpectralCloud:
         return np.array(structured_to_unstructured(vertices[list(group)], dtype))
 
     return SpectralCloud(
-        points=columns(_GEOMETRY[:3], np.float32),
-        normals=columns(_GEOMETRY[3:], np.float32),
-        colours=columns(_CHANNELS, np.uint8),
+        points=columns(tuple("xyz"), np.float32),
+        normals=columns(NORMALS, np.float32),
+        colours=columns(COLOURS, np.uint8),
         spectra=columns(tuple(bands), np.float32),
         wavelengths_nm=np.array(list(bands.values())),
         extra={
             own_name(name): np.array(vertices[name], np.float32)
             for name in names
-            if name not in bands and name not in (*_GEOMETRY, *_CHANNELS)
+            if name not in bands and name not in (*_GEOMETRY, *COLOURS)
         },
     )

@@ -19,6 +19,7 @@ from hsi_sc_nerf import __version__
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import (
     CHUNK_POINTS,
+    COLOURS,
     CloudStream,
     band_property_names,
     comment_lines,
@@ -42,7 +43,6 @@ _LAS_POINT_FORMAT = 7
 _LAS_TEXT_RECORD = 3
 """The specification's record for a text that describes the file."""
 _LAS_NORMALS = ("NormalX", "NormalY", "NormalZ")  # CloudCompare takes these for normals
-_COLOURS = ("red", "green", "blue")
 _EIGHT_TO_SIXTEEN_BITS = 257
 _PLACES = {"coordinates": "x y z"}
 """Attribute of variables with a wavelength."""
@@ -120,14 +120,14 @@ def _write_las(path: Path, cloud: CloudStream) -> None:
     header = laspy.LasHeader(point_format=_LAS_POINT_FORMAT, version="1.4")
     header.scales = np.full(3, LAS_STEP_M)
     header.system_identifier, header.generating_software = "hyperspectral turntable", f"hsi-sc-nerf {__version__}"
-    text = "\n".join(comment_lines([*_COLOURS, *cloud.extra_names], cloud.run))
+    text = "\n".join(comment_lines([*COLOURS, *cloud.extra_names], cloud.run))
     header.vlrs.append(laspy.VLR("LASF_Spec", _LAS_TEXT_RECORD, "text area description", text.encode()))
     header.add_extra_dims([laspy.ExtraBytesParams(name, "f4") for name in names])
     with atomic_write(path) as (temporary,), laspy.open(str(temporary), mode="w", header=header) as writer:
         for chunk in cloud.chunks:
             record = laspy.ScaleAwarePointRecord.zeros(len(chunk), header=header)
             record.x, record.y, record.z = np.asarray(chunk.points, np.float64).T
-            for name, channel in zip(_COLOURS, chunk.colours.T, strict=True):
+            for name, channel in zip(COLOURS, chunk.colours.T, strict=True):
                 record[name] = channel.astype(np.uint16) * _EIGHT_TO_SIXTEEN_BITS
             columns = [*chunk.normals.T, *chunk.spectra.T, *chunk.extra.values()]
             for name, values in zip(names, columns, strict=True):

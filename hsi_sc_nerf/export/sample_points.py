@@ -22,8 +22,10 @@ from plyfile import PlyData
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.comparison import read_surface
 from hsi_sc_nerf.export.cloud import (
+    COLOURS,
     LIGHT_COLUMNS,
     MAX_INCIDENCE_DEG,
+    NORMALS,
     band_property_names,
     comment_lines,
     estimate_normals,
@@ -41,8 +43,6 @@ from hsi_sc_nerf.surface.surface_depth import MIN_OPACITY, render_object, surfac
 from hsi_sc_nerf.terminal import progress_bar
 
 BATCH_POINTS = 1 << 12
-_NORMAL = ("nx", "ny", "nz")
-_COLOUR = ("red", "green", "blue")
 _NO_SPECTRUM_GREY = 64
 """Colour of points without a spectrum, if the file has no colours of its own."""
 
@@ -237,11 +237,11 @@ class PlyPoints:
 
         They are 0 for a point without one, such as a vertex of no face.
         """
-        if len(self.triangles) and not self.has(_NORMAL):
+        if len(self.triangles) and not self.has(NORMALS):
             return Mesh(self.positions, self.triangles).vertex_normals()
-        if not self.has(_NORMAL):
+        if not self.has(NORMALS):
             return estimate_normals(self.positions)
-        normals = np.stack([np.asarray(self.content["vertex"][name], float) for name in _NORMAL], axis=1)
+        normals = np.stack([np.asarray(self.content["vertex"][name], float) for name in NORMALS], axis=1)
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
         return np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0)
 
@@ -291,13 +291,13 @@ def write_sampled_ply(
             irradiance = found.spectra.mean(axis=1) / spectra.mean(axis=1)
         names = [*band_property_names(wavelengths_nm, "material"), *LIGHT_COLUMNS]
         columns |= zip(names, [*spectra.T, irradiance, relative_std * irradiance], strict=True)
-    if not points.has(_NORMAL):
-        columns |= zip(_NORMAL, found.normals.T.astype(np.float32), strict=True)
-    if not points.has(_COLOUR):
+    if not points.has(NORMALS):
+        columns |= zip(NORMALS, found.normals.T.astype(np.float32), strict=True)
+    if not points.has(COLOURS):
         colours = found.spectra[:, rgb_bands]
         known = np.isfinite(colours)
         colours = np.where(known, to_8_bit(np.where(known, colours, 0.0)), np.uint8(_NO_SPECTRUM_GREY))
-        columns |= zip(_COLOUR, colours.T, strict=True)
+        columns |= zip(COLOURS, colours.T, strict=True)
     earlier = [name for name in vertices.dtype.names if is_of_a_run(name)]
     kept = {name: vertices[name] for name in vertices.dtype.names if name not in (*columns, *earlier)}
     vertex = ply_vertices(kept | columns)

@@ -16,20 +16,21 @@ from jaxtyping import Shaped
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import (
+    COLOURS,
     COLUMNS,
     MATERIAL,
+    NORMALS,
     REFLECTANCE,
     SpectralCloud,
     band_property_names,
     cloud_attributes,
+    material_names,
 )
 
 if TYPE_CHECKING:
     import xarray  # an optional package
 
 WAVELENGTH_ATTRIBUTES = {"units": "nm", "long_name": "centre of the band", "standard_name": "radiation_wavelength"}
-_NORMALS = ("nx", "ny", "nz")
-_COLOURS = ("red", "green", "blue")
 _SPECTRAL = ("reflectance", "material")
 _ANCILLARY = {"reflectance": ("spectral_std", "sampled_std"), "irradiance": ("irradiance_std",)}
 """Standard deviations by the variable that they are of."""
@@ -73,7 +74,7 @@ def from_xarray(table: xarray.Dataset) -> SpectralCloud:
         >>> len(from_xarray(table.isel(point=slice(10))))
         10
     """
-    needed = ("reflectance", "wavelength", *"xyz", *_NORMALS, *_COLOURS)
+    needed = ("reflectance", "wavelength", *"xyz", *NORMALS, *COLOURS)
     missing = [name for name in needed if name not in table.variables]
     if missing or table["reflectance"].dims != ("point", "wavelength"):
         lacking = ", ".join(missing) or "reflectance (point, wavelength)"
@@ -89,7 +90,7 @@ def from_xarray(table: xarray.Dataset) -> SpectralCloud:
     if "material" in table:
         extra |= zip(band_property_names(wavelengths_nm, "material"), table["material"].values.T, strict=True)
     points, normals, colours = (
-        np.stack([table[name].values for name in names], axis=1) for names in ("xyz", _NORMALS, _COLOURS)
+        np.stack([table[name].values for name in names], axis=1) for names in ("xyz", NORMALS, COLOURS)
     )
     return SpectralCloud(points, normals, colours, table["reflectance"].values, wavelengths_nm, extra)
 
@@ -99,29 +100,29 @@ def table_variables(
 ) -> Iterator[tuple[str, str, tuple[str, ...], dict[str, str]]]:
     """Name, type, dimensions and attributes of each variable; the positions of points are coordinates."""
     extra_names, meanings = tuple(extra_names), dict(zip(_SPECTRAL, (REFLECTANCE, MATERIAL), strict=True)) | COLUMNS
-    of_material = _of_material(wavelengths_nm, extra_names)
+    of_material = material_names(wavelengths_nm, extra_names)
     spectral = _SPECTRAL if of_material else _SPECTRAL[:1]
     others = (name for name in extra_names if name not in of_material)
-    for name in (*spectral, *"xyz", *_NORMALS, *_COLOURS, *others):
+    for name in (*spectral, *"xyz", *NORMALS, *COLOURS, *others):
         attributes = dict(zip(("units", "long_name"), meanings.get(name, ()), strict=False))
         if known := [std for std in _ANCILLARY.get(name, ()) if std in extra_names]:
             attributes["ancillary_variables"] = " ".join(known)
         if name in spectral:
             yield name, "<f4", ("point", "wavelength"), attributes
         else:
-            yield name, "u1" if name in _COLOURS else "<f4", ("point",), attributes
+            yield name, "u1" if name in COLOURS else "<f4", ("point",), attributes
 
 
 def table_columns(cloud: SpectralCloud) -> dict[str, Shaped[np.ndarray, "n *bands"]]:
     """The numbers of each variable."""
     extra = dict(cloud.extra)
-    material = [extra.pop(name) for name in _of_material(cloud.wavelengths_nm, tuple(extra))]
+    material = [extra.pop(name) for name in material_names(cloud.wavelengths_nm, tuple(extra))]
     return {
         "reflectance": cloud.spectra,
         **({"material": np.stack(material, axis=-1)} if material else {}),
         **dict(zip("xyz", cloud.points.T, strict=True)),
-        **dict(zip(_NORMALS, cloud.normals.T, strict=True)),
-        **dict(zip(_COLOURS, cloud.colours.T, strict=True)),
+        **dict(zip(NORMALS, cloud.normals.T, strict=True)),
+        **dict(zip(COLOURS, cloud.colours.T, strict=True)),
         **extra,
     }
 
@@ -129,9 +130,3 @@ def table_columns(cloud: SpectralCloud) -> dict[str, Shaped[np.ndarray, "n *band
 def table_attributes(run: str) -> dict[str, str]:
     """What a table says of itself."""
     return {"Conventions": "CF-1.11", **cloud_attributes(run)}
-
-
-def _of_material(wavelengths_nm: Shaped[np.ndarray, "bands"], extra_names: tuple[str, ...]) -> list[str]:
-    """Names of the columns that hold the material's reflectance, one a band; none if the cloud lacks any."""
-    names = band_property_names(wavelengths_nm, "material")
-    return names if set(names) <= set(extra_names) else []
