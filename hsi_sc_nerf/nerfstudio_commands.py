@@ -61,7 +61,9 @@ def extend_nerfstudio_commands() -> None:
         # ``python -m`` runs a script under another name.
         module = sys.modules.get(name)
         if module is not None:
-            _when_complete(module)
+            # At the first use of the entry point, which is defined last, the commands are wrapped.
+            module.__class__ = _ScriptBeingImported
+            hasattr(module, "entrypoint")  # wraps a script that is complete
 
 
 def _callers() -> list[types.SimpleNamespace]:
@@ -71,12 +73,6 @@ def _callers() -> list[types.SimpleNamespace]:
         found.append(types.SimpleNamespace(function=frame.f_code.co_name))
         frame = frame.f_back  # type: ignore[assignment]
     return found
-
-
-def _when_complete(module: types.ModuleType) -> None:
-    """Wrap the commands of a script at the first use of its entry point, which is defined last."""
-    module.__class__ = _ScriptBeingImported
-    hasattr(module, "entrypoint")  # wraps a script that is complete
 
 
 class _ScriptBeingImported(types.ModuleType):

@@ -215,10 +215,6 @@ def masked_mean(values: Float[Tensor, "*shape"], mask: Bool[Tensor, "*shape"] | 
     return narrow(selected.sum() / mask.sum().clamp_min(1), values)
 
 
-def _wider(dtype: torch.dtype) -> torch.dtype:
-    return torch.float32 if dtype == torch.float16 else torch.float64
-
-
 def _within_range(values: Tensor, dtype: torch.dtype) -> Tensor:
     """Cast to ``dtype``; finite values beyond its range become its largest number, non-finite ones stay."""
     largest = torch.finfo(dtype).max
@@ -233,7 +229,7 @@ class _Widen(torch.autograd.Function):
     @staticmethod
     def forward(ctx, values: Tensor) -> Tensor:
         ctx.dtype = values.dtype
-        return values.to(_wider(values.dtype))
+        return values.to(torch.float32 if values.dtype == torch.float16 else torch.float64)
 
     @staticmethod
     def backward(ctx, gradient: Tensor) -> Tensor:

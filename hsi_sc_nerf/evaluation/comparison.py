@@ -136,7 +136,12 @@ def compare(
     """
     config = config or CompareConfig()
     alignment = config.align or reference.align
-    _check(config, alignment)
+    check_options(config)
+    if config.with_scale and alignment == "none":
+        raise InputError(
+            "--with-scale changes the cloud's size while it is aligned, but --align is none (as for a simulated "
+            "session where it is not given); choose one, such as --align icp."
+        )
     cloud = surface_of(Path(cloud_path), config)
     _check_sizes(str(cloud_path), cloud, reference, alignment, config)
     registration = _register(str(cloud_path), cloud, reference, alignment, config, track)
@@ -225,15 +230,6 @@ def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
     read = trimesh.load_mesh(path, process=False)
     return np.asarray(read.vertices, float), np.asarray(read.faces, np.int64)
-
-
-def _check(config: CompareConfig, alignment: Alignment) -> None:
-    check_options(config)
-    if config.with_scale and alignment == "none":
-        raise InputError(
-            "--with-scale changes the cloud's size while it is aligned, but --align is none (as for a simulated "
-            "session where it is not given); choose one, such as --align icp."
-        )
 
 
 def _check_sizes(

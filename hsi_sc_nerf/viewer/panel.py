@@ -149,7 +149,8 @@ class SpectralPanel(torch.nn.Module):
             camera.metadata = views.metadata(view, camera.device)
         outputs = render(camera)
         spectral = outputs.pop("spectral")
-        pictures = {"rgb": outputs.pop("rgb").clamp(0.0, 1.0), "band": self._band(spectral)}
+        band = nearest_bands(self.wavelengths_nm, [self.band.value]).tolist()
+        pictures = {"rgb": outputs.pop("rgb").clamp(0.0, 1.0), "band": spectral[..., band]}
         if self.composite is not None:
             chosen = COMPOSITES[self.composite.value]
             pictures["composite"] = composite(spectral, self.wavelengths_nm, chosen.wavelengths_nm).clamp(0.0, 1.0)
@@ -227,9 +228,6 @@ class SpectralPanel(torch.nn.Module):
         parts.append("**spectral_angle** between rendering and measurement, at a training view only")
         parts.append(inline_image(bar, "colours {:g} to {:g} rad".format(*ANGLE_DRAWN_RAD)))
         return "\n\n".join(parts)
-
-    def _band(self, spectral: Float[Tensor, "h w bands"]) -> Float[Tensor, "h w 1"]:
-        return spectral[..., nearest_bands(self.wavelengths_nm, [self.band.value]).tolist()]
 
     @staticmethod
     def _shown(viewer: Viewer, output: str) -> bool:
