@@ -98,7 +98,7 @@ def calibration_section(dataset: PackedDataset) -> Section:
             from_zero=True,
         )
         caption = "Noise of one pixel's reflectance (standard deviation) by band, at the object's mean reflectance."
-        blocks.append(Figure([chart], caption))
+        blocks.append(Figure({"": chart}, caption))
     for name, summary in (
         ("white_reference.png", "How the white reference was found"),
         ("lamp_drift.png", "Drift of the lamps"),
@@ -175,7 +175,9 @@ def _flagged_values(dataset: PackedDataset, found: Mapping[str, Any]) -> list[Fi
         alt="Fraction of values that were clipped or flagged, by wavelength",
         from_zero=True,
     )
-    return [Figure([chart], "Values of all frames that were clipped or are no measurement, per cent of each band.")]
+    return [
+        Figure({"": chart}, "Values of all frames that were clipped or are no measurement, per cent of each band.")
+    ]
 
 
 def masks_section(dataset: PackedDataset) -> Section:
@@ -192,7 +194,7 @@ def masks_section(dataset: PackedDataset) -> Section:
     chart = _by_frame(areas_px, "pixels", "Size of the object's mask by frame")
     blocks: list[Block] = [
         Table("The object's masks.", ("", "found"), rows),
-        Figure([chart], "Pixels of the object in each frame. Check the masks of frames that stand out below."),
+        Figure({"": chart}, "Pixels of the object in each frame. Check the masks of frames that stand out below."),
         *_folded_picture(dataset, "masks.png", "All frames in pseudo-RGB with the outline of the mask in magenta"),
     ]
     closed = is_full_turn(np.array([frame.angle_deg for frame in dataset.frames]))
@@ -246,7 +248,7 @@ def poses_section(dataset: PackedDataset) -> Section:
         charts[title] = _by_frame(np.append(np.nan, steps_deg), "step (degrees)", f"{title} by frame")
     if charts:
         caption = "Root mean square reprojection error in pixels; turn of the table, positive counter-clockwise."
-        blocks.append(Figure(list(charts.values()), caption, list(charts), columns=2))
+        blocks.append(Figure(charts, caption, columns=2))
     blocks += _folded_picture(dataset, "poses.png", "Cameras round the object, reprojection errors and steps")
     return Section("poses", "Poses", blocks, findings)
 
@@ -301,4 +303,4 @@ def _pose_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
 def _folded_picture(dataset: PackedDataset, name: str, summary: str) -> list[Block]:
     """A picture of the dataset's ``report/``, which a click opens; nothing where it is missing."""
     path = dataset.root / "report" / name
-    return [Folded(summary, [Figure([embedded_file(path, summary)], f"{summary}.")])] if path.is_file() else []
+    return [Folded(summary, [Figure({"": embedded_file(path, summary)}, f"{summary}.")])] if path.is_file() else []

@@ -65,10 +65,9 @@ class Figure:
     """Pictures or charts with a caption that states their units."""
 
     kind: ClassVar[str] = "figure"
-    pictures: Sequence[Markup]
+    pictures: Mapping[str, Markup]
+    """By their titles; a single one has an empty title."""
     caption: str
-    titles: Sequence[str] = ()
-    """Titles of the pictures, where they have any."""
     columns: int = 1
     """Number of pictures side by side on a wide screen."""
 

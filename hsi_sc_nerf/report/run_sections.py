@@ -59,7 +59,7 @@ def training_section(scalars: Scalars, stage_ends: Mapping[str, int]) -> Section
     def named(prefix: str) -> dict[str, str]:
         return {tag: tag.removeprefix(prefix).replace("_", " ") for tag in scalars if tag.startswith(prefix)}
 
-    charts, titles = [], []
+    charts = {}
     for title, y_label, tags, logarithmic in (
         ("Loss of training batches", "weighted loss", {"Train Loss": "sum"} | named(_LOSSES), True),
         ("Peak signal-to-noise ratio", "PSNR (dB)", _PSNR, False),
@@ -68,17 +68,14 @@ def training_section(scalars: Scalars, stage_ends: Mapping[str, int]) -> Section
     ):
         curves = _curves(scalars, tags)
         if curves:
-            charts.append(
-                line_chart(
-                    curves,
-                    x_label="step",
-                    y_label=y_label,
-                    alt=f"{title} over the training steps",
-                    logarithmic=logarithmic,
-                    marks=marks,
-                )
+            charts[title] = line_chart(
+                curves,
+                x_label="step",
+                y_label=y_label,
+                alt=f"{title} over the training steps",
+                logarithmic=logarithmic,
+                marks=marks,
             )
-            titles.append(title)
     caption = (
         "Terms of the loss are weighted and have no unit; those that stay tiny are left out. In the masked stage "
         "most training rays are the object's: its loss and PSNR do not compare with those of whole frames."
@@ -86,7 +83,7 @@ def training_section(scalars: Scalars, stage_ends: Mapping[str, int]) -> Section
     steps, psnr_db = scalars.get("Train Metrics Dict/psnr", (np.zeros(0), np.zeros(0)))
     last_stage_from = ([0.0, 0.0, *marks.values()])[-2] if marks else 0.0
     findings = judge_training(psnr_db[steps >= last_stage_from])
-    return Section("training", "Training", [Figure(charts, caption, titles, columns=2)], findings)
+    return Section("training", "Training", [Figure(charts, caption, columns=2)], findings)
 
 
 def judge_training(psnr_db: Float[np.ndarray, "n"]) -> list[Finding]:
@@ -206,7 +203,7 @@ def comparison_section(comparison: Mapping[str, Any] | None, source: Path) -> Se
     picture = source.with_name("distances.png")
     if picture.is_file():
         alt = "The cloud and the reference, coloured by the distance to the other"
-        blocks.append(Folded("Where the distances are", [Figure([embedded_file(picture, alt)], f"{alt}.")]))
+        blocks.append(Folded("Where the distances are", [Figure({"": embedded_file(picture, alt)}, f"{alt}.")]))
     return Section("comparison", title, blocks, findings)
 
 
@@ -251,7 +248,7 @@ def _comparison_blocks(comparison: Mapping[str, Any]) -> list[Block]:
     caption = "Precision: fraction of the cloud within the threshold of the reference. Recall: the converse."
     return [
         Table(caption, *scored),
-        Figure([chart], "Precision, recall and F-score over the distance threshold, per cent."),
+        Figure({"": chart}, "Precision, recall and F-score over the distance threshold, per cent."),
         Table("Distances, mm.", *distances),
     ]
 

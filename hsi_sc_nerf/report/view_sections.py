@@ -88,22 +88,20 @@ def views_section(views: Sequence[HeldOutView], held_out: int, white: float) -> 
         view = views[index]
         crop = crop_around(view.scores.mask)
         inside = torch.from_numpy(view.scores.mask[crop])
-        maps = (
-            (view.scores.angle_rad, ANGLE_DRAWN_RAD, ANGLE_COLOURS, "Map of the spectral angle"),
-            (view.scores.error, ERROR_DRAWN, _ERROR_COLOURS, "Map of the error"),
-        )
-        pictures = [
-            embedded_array(to_8_bit(rgb[crop] / white), f"{view.scores.name} as {how}, pseudo-RGB")
+        pictures = {
+            how: embedded_array(to_8_bit(rgb[crop] / white), f"{view.scores.name} as {how}, pseudo-RGB")
             for rgb, how in ((view.measured_rgb, "measured"), (view.rendered_rgb, "rendered"))
-        ]
-        for values, drawn, colours, label in maps:
+        }
+        for title, values, drawn, colours in (
+            ("spectral angle", view.scores.angle_rad, ANGLE_DRAWN_RAD, ANGLE_COLOURS),
+            ("error", view.scores.error, ERROR_DRAWN, _ERROR_COLOURS),
+        ):
             shown = torch.from_numpy(values[crop]).float().masked_fill(~inside, torch.nan)
             picture = to_8_bit(coloured(shown, drawn, colours).numpy())
-            pictures.append(embedded_array(picture, f"{label} of {view.scores.name}"))
+            pictures[title] = embedded_array(picture, f"Map of the {title} of {view.scores.name}")
         sam, rmse = (view.scores.metrics[key] for key in ("sam", "rmse"))
         scored = f"SAM {sam:.4f} rad, RMSE {rmse:.4f}" if np.isfinite(sam) else _NO_SCORE
-        caption = f"{view.scores.name}: {scored}."
-        blocks.append(Figure(pictures, caption, ("measured", "rendered", "spectral angle", "error"), columns=4))
+        blocks.append(Figure(pictures, f"{view.scores.name}: {scored}.", columns=4))
     return Section("views", "Held-out views", blocks, judge_views([view.scores for view in views]))
 
 
@@ -200,7 +198,7 @@ def bands_section(
             f"{angles.mean():.4f}, median {middle:.4f}, 95th percentile {high:.4f} rad. The largest "
             f"{100.0 - _PERCENTILE_DRAWN:g} % are not drawn."
         )
-    figure = Figure(list(charts.values()), caption, list(charts), columns=2)
+    figure = Figure(charts, caption, columns=2)
     findings = judge_bands(rmse[0].y, wavelengths_nm, typical_uncertainty)
     return Section("bands", "Accuracy by band and pixel", [figure], findings)
 
@@ -251,8 +249,8 @@ def spectra_section(view: HeldOutView, wavelengths_nm: Float[np.ndarray, "bands"
         "Reflectance over wavelength. Solid with a band: measured, mean and standard deviation over the pixels "
         "around the point, that is noise and texture together. Dashed: rendered, mean over the same pixels."
     )
-    marked = Figure([picture], f"Points in {view.scores.name}, as measured.")
-    blocks = [marked, Figure(list(charts.values()), caption, list(charts), columns=2)]
+    marked = Figure({"": picture}, f"Points in {view.scores.name}, as measured.")
+    blocks = [marked, Figure(charts, caption, columns=2)]
     return Section("spectra", "Spectra", blocks, judge_spectra(points))
 
 
