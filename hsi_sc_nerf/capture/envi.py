@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -171,9 +170,7 @@ class CubeLines:
             raise InputError(f"{self._cube.data_path}: cannot be read ({error.strerror}); check the file.") from error
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         os.close(self._file)
 
     def __getitem__(self, line: int) -> Num[np.ndarray, "samples bands"]:

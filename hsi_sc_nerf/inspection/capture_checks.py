@@ -180,7 +180,7 @@ def check_frames(
     """
     return [
         _exposure(session, quicklooks),
-        _focus(session, quicklooks),
+        _focus(quicklooks),
         _copies(session, quicklooks),
         _other_object(session, quicklooks, detections),
     ]
@@ -235,7 +235,7 @@ def _exposure(session: Session, quicklooks: Sequence[Quicklook]) -> Finding:
     return Finding("exposure", found, f"{session.path}: {text}." if found == "red" else f"Exposure: {text}.", values)
 
 
-def _focus(session: Session, quicklooks: Sequence[Quicklook]) -> Finding:
+def _focus(quicklooks: Sequence[Quicklook]) -> Finding:
     sharpness = np.array([q.sharpness_per_px for q in quicklooks])
     relative = sharpness / max(float(np.median(sharpness)), 1e-12)
     blurred = [q.name for q, ratio in zip(quicklooks, relative, strict=True) if ratio < BLURRED]

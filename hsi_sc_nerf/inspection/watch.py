@@ -69,7 +69,7 @@ class Watch:
                 continue
             self._seen.add(files.name)
             self.captures += 1
-            lines.append(self._line(opened[0], self._info.marker_dictionary, files.name.lower() == white))
+            lines.append(self._line(opened[0], files.name.lower() == white))
         for name in self.incomplete if lines else ():
             if name in waited_for:
                 lines += self._once(f"{name}: NOT COMPLETE, {self.incomplete[name]}")
@@ -85,7 +85,7 @@ class Watch:
         """Whether the dark cube, which a SPECIM IQ writes beside the counts, is there if earlier captures had one."""
         return self._first is None or self._first.dark is None or "dark" in files.headers
 
-    def _line(self, capture: Capture, dictionary: str | None, is_white: bool) -> str:
+    def _line(self, capture: Capture, is_white: bool) -> str:
         quicklook = quicklook_of(capture, white_counts(capture))
         saturated = float(quicklook.at_top_fraction.mean()) if quicklook.top_counts in DIGITISER_LIMITS else 0.0
         dark = float(quicklook.dark_fraction.mean())
@@ -104,16 +104,17 @@ class Watch:
                 faults.append(f"taken on {acquisition_day(capture)}, not {acquisition_day(self._first)}")
         if not is_white:
             self._first = self._first or capture
-            faults += self._compare(quicklook, dictionary)
+            faults += self._compare(quicklook)
             parts += [f"sharpness {quicklook.sharpness_per_px:.3f}/px", f"markers {self._markers[-1]}"]
         if faults:
             self.flagged.append(capture.name)
         return f"{capture.name}: {', '.join(parts)}; {', '.join(faults).upper() if faults else 'ok'}"
 
-    def _compare(self, quicklook: Quicklook, dictionary: str | None) -> list[str]:
+    def _compare(self, quicklook: Quicklook) -> list[str]:
         """What is wrong with a frame beside those before it."""
         faults = []
-        self._dictionary = dictionary or self._dictionary or find_dictionary([quicklook.gray])
+        stated = self._info.marker_dictionary
+        self._dictionary = stated or self._dictionary or find_dictionary([quicklook.gray])
         markers = 0 if self._dictionary is None else len(detect_markers(quicklook.gray, self._dictionary))
         if len(self._quicklooks) >= FEWEST_TO_COMPARE:
             if quicklook.sharpness_per_px < BLURRED * np.median([q.sharpness_per_px for q in self._quicklooks]):
