@@ -99,6 +99,22 @@ def test_a_full_disk_names_the_file_and_no_temporary_one(tmp_path, limit_of_file
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_folder_replaces_a_folder_whole_or_not_at_all(tmp_path):
+    target = tmp_path / "cloud.zarr"
+
+    def write(content, fails=False):
+        with atomic_write(target) as (temporary,):
+            temporary.mkdir()
+            (temporary / content).touch()
+            assert not fails
+
+    write("old")
+    write("new")
+    with pytest.raises(AssertionError):
+        write("half", fails=True)
+    assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")] == ["cloud.zarr", "cloud.zarr/new"]
+
+
 def test_what_a_killed_process_left_is_deleted_and_what_a_running_one_writes_is_kept(tmp_path):
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()

@@ -40,7 +40,8 @@ def test_exports_hold_the_same_numbers(tmp_path, text, encoding):
     np.testing.assert_allclose(columns["coefficient"], SLOPES)
     calibration = read_calibration(path)
     assert calibration.unit == "%"
-    np.testing.assert_allclose(calibration.values(np.array([[0.5, 0.25, 9.0]])), [14.2 + 0.0065 - 0.00525])
+    found = calibration.of(np.array([[0.5, 0.25, 9.0]]), calibration.wavelengths_nm)
+    np.testing.assert_allclose(found, [14.2 + 0.0065 - 0.00525])
 
 
 def test_heads_of_a_calibration_that_a_spreadsheet_saved(tmp_path):
@@ -67,7 +68,8 @@ def test_heads_of_a_calibration_that_a_spreadsheet_saved(tmp_path):
 )
 def test_an_intercept_in_the_first_line_as_software_writes_it(tmp_path, text):
     calibration = read_calibration(write(tmp_path, text))
-    np.testing.assert_allclose(calibration.values(np.array([[0.5, 9.0]])), [14.2 + 0.25])
+    found = calibration.of(np.array([[0.5, 9.0]]), calibration.wavelengths_nm)
+    np.testing.assert_allclose(found, [14.2 + 0.25])
 
 
 def test_other_tables_of_the_same_exports(tmp_path):
