@@ -18,7 +18,7 @@ from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.poses.marker_detection import dictionary_by_name, marker_pattern
 from hsi_sc_nerf.simulate import own_mesh, plants
-from hsi_sc_nerf.simulate.effects import effect_rng, find_effect, of_kind
+from hsi_sc_nerf.simulate.effect import effect_rng, find_effect, of_kind
 from hsi_sc_nerf.simulate.effects.motion import FramePlan, MotionEffect, OffCentre
 from hsi_sc_nerf.simulate.mesh import SEGMENTS, VERTEX_SPACING_M, cylinder, quads, sphere
 from hsi_sc_nerf.simulate.render import Part, Renderer

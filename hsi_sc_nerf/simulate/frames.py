@@ -11,7 +11,8 @@ from jaxtyping import Float, UInt16
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.simulate import assemble
-from hsi_sc_nerf.simulate.effects import detector, effect_rng, find_effect, of_kind
+from hsi_sc_nerf.simulate.effect import effect_rng, find_effect, of_kind
+from hsi_sc_nerf.simulate.effects import detector
 from hsi_sc_nerf.simulate.effects.detector import ExposureEffect, ReadoutEffect, SpectralSmile
 from hsi_sc_nerf.simulate.effects.image import (
     Drying,

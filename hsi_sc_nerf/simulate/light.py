@@ -21,7 +21,7 @@ import scipy.sparse
 from jaxtyping import Float
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
-from hsi_sc_nerf.simulate.effects import Effect, of_kind
+from hsi_sc_nerf.simulate.effect import Effect, of_kind
 from hsi_sc_nerf.simulate.render import Hits, Lens, Renderer
 from hsi_sc_nerf.simulate.surface import SceneSurface
 

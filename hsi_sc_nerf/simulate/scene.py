@@ -16,7 +16,8 @@ from typing import Any, Literal, TypeAlias
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError, shown
 from hsi_sc_nerf.settings_file import between, check_ranges, read_dataclass, read_yaml
-from hsi_sc_nerf.simulate.effects import Effect, detector, image, light, motion
+from hsi_sc_nerf.simulate.effect import Effect
+from hsi_sc_nerf.simulate.effects import detector, image, light, motion
 from hsi_sc_nerf.simulate.effects.detector import SensorSettings
 from hsi_sc_nerf.simulate.materials import MATERIALS, Material, read_materials
 

@@ -14,7 +14,7 @@ from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write
 from hsi_sc_nerf.simulate import truth
-from hsi_sc_nerf.simulate.effects import find_effect
+from hsi_sc_nerf.simulate.effect import find_effect
 from hsi_sc_nerf.simulate.effects.image import ImageRotation
 from hsi_sc_nerf.simulate.frames import SimulatedCapture, Simulation
 from hsi_sc_nerf.simulate.scene import Scene

@@ -18,7 +18,7 @@ from jaxtyping import Float, UInt16
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.settings_file import between
-from hsi_sc_nerf.simulate.effects import Effect
+from hsi_sc_nerf.simulate.effect import Effect
 from hsi_sc_nerf.simulate.light import lamp_photons
 
 Counts: TypeAlias = Float[np.ndarray, "lines samples bands"]

@@ -15,7 +15,7 @@ from scipy.special import ive
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.settings_file import between
-from hsi_sc_nerf.simulate.effects import Effect
+from hsi_sc_nerf.simulate.effect import Effect
 from hsi_sc_nerf.simulate.light import lamp_photons
 from hsi_sc_nerf.simulate.materials import Material, PlantTissue, over, smooth_noise, smoothstep, water_absorbance
 

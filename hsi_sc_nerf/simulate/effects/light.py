@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from hsi_sc_nerf.geometry.camera import unit_vectors
 from hsi_sc_nerf.settings_file import between
-from hsi_sc_nerf.simulate.effects import Effect
+from hsi_sc_nerf.simulate.effect import Effect
 from hsi_sc_nerf.simulate.light import HitLight, Reflection, SurfaceLight, SurfaceLightEffect, ViewLightEffect
 from hsi_sc_nerf.simulate.render import RAY_START_M, Hits
 from hsi_sc_nerf.simulate.surface import SceneSurface

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.geometry.camera import rotation_about_z, turntable_camera_to_world
 from hsi_sc_nerf.settings_file import between
-from hsi_sc_nerf.simulate.effects import Effect
+from hsi_sc_nerf.simulate.effect import Effect
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from hsi_sc_nerf.calibration.white_reference import white_reference
 from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.simulate import assemble, frames
+from hsi_sc_nerf.simulate.effect import effect_rng
 from hsi_sc_nerf.simulate.effects import detector as sensor
-from hsi_sc_nerf.simulate.effects import effect_rng
 from hsi_sc_nerf.simulate.effects.detector import FEW_ELECTRONS, many_electrons, poisson
 from hsi_sc_nerf.simulate.effects.image import gaussian_kernel
 from hsi_sc_nerf.simulate.frames import Simulation
