@@ -34,9 +34,9 @@ from hsi_sc_nerf.processing.view_changes import (
 from hsi_sc_nerf.processing.visual_hull import VotedHull
 from hsi_sc_nerf.terminal import screen_table
 
-LEAST_VIEW_CHANGE_PERCENT = 0.5
-"""Least change of a point with its direction: more than wrong poses cause on a bumpy object
-(docs/validation/effects.md)."""
+LEAST_VIEW_CHANGE_PERCENT = 0.35
+"""Least change of a point with its direction: where modelling it begins to gain, and more than wrong poses cause on a
+bumpy object (docs/validation/effects.md)."""
 LEAST_PICTURE = 0.005
 """Least gain of an image of the chamber, reflectance; the noise of a pixel is larger."""
 LEAST_HEIGHT_CHANGE_PERCENT = 2.0
