@@ -40,7 +40,7 @@ def stated(rotation_deg):
     return Uncertainty(0.01, 0.01, 0.01, np.zeros(4), rotation_deg, 0.001)
 
 
-@pytest.mark.parametrize(("rms", "noise", "present"), [(0.02, 0.001, True), (0.02, 0.008, False), (0.005, 0, False)])
+@pytest.mark.parametrize(("rms", "noise", "present"), [(0.02, 0.001, True), (0.02, 0.008, False), (0.003, 0, False)])
 def test_evidence_has_to_exceed_its_noise_and_a_least_size(rms, noise, present):
     effect = view_dependence(Change(rms, noise))
     assert (effect.present, effect.evidence, effect.noise) == (present, 100.0 * rms, 100.0 * noise)
