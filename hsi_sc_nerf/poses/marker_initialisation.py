@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, Int
 from scipy.optimize import minimize_scalar
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -133,7 +134,7 @@ class _Circles:
         return start.turned_over() if flat.any() and up[flat].sum() < 0 else start
 
 
-def linked_rows(frame: Int[np.ndarray, "n"], marker: Int[np.ndarray, "n"]) -> np.ndarray:
+def linked_rows(frame: Int[np.ndarray, "n"], marker: Int[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
     """Mask of the rows in the largest set of frames that are linked by markers seen in two or more of them."""
     frames, f = np.unique(frame, return_inverse=True)
     markers, m = np.unique(marker, return_inverse=True)

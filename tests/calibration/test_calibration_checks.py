@@ -121,7 +121,7 @@ def tarp():
 def session(tmp_path):
     """Writes a session with the given white and opens it; returns its findings and itself."""
 
-    def write(white, frames=None, **header):
+    def write(white, frames=None):
         frames = [frame(number) for number in range(FRAMES)] if frames is None else frames
         for number, reflectance in enumerate(frames):
             write_capture(tmp_path, f"pear_{number}", expose(reflectance))
