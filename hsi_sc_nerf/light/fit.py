@@ -167,7 +167,9 @@ class _LightFitting(MaterialFitting):
         """Add the lamp that explains most of the residuals; False if none is significant."""
         self.bounce()
         directions = even_directions(CANDIDATES)
-        directions = directions[directions[:, 2] > BEHIND]
+        # The disc hides what shines from below its plane; an upright body would hardly tell it from light from above.
+        up = self.elements.rotations[:, 2].mean(axis=0)
+        directions = directions[(directions[:, 2] > BEHIND) & (directions @ up > 0.0)]
         units = self.elements.lamps_at(self.views, directions).irradiance
         residual, jacobian = self.linearised()
         expected = 1.0 / self.irradiance().mean(axis=1, keepdims=True)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import light_on_a_ball
 import numpy as np
 import pytest
 import trimesh
@@ -64,6 +65,18 @@ def test_a_lamp_has_its_own_colour(ball):
     seen = seen_rows(views, ball)
     ratio = (found.material / material)[seen]
     assert np.quantile(np.abs(ratio[:, 0] / ratio[:, 1] - 1.0), 0.9) < 0.03
+
+
+@pytest.mark.parametrize("to_lamp", [TO_LAMP, np.array([0.3, -0.7, 0.65])])
+def test_no_lamp_is_searched_for_below_the_plane_of_the_disc(ball, monkeypatch, to_lamp):
+    monkeypatch.setattr(light_on_a_ball, "TO_LAMP", to_lamp)
+    views, *_ = measured(ball, 0.5)
+    fitting = fit_module._LightFitting(ball, views, FACING, np.zeros(3))
+    fitting.converge()
+    assert fitting.add_lamp()
+    up = ball.rotations[0, 2]
+    assert (to_lamp @ up > 0.0) == (to_lamp is TO_LAMP)
+    assert fitting.light.to_lamps[0] @ up > 0.0
 
 
 @pytest.mark.slow
