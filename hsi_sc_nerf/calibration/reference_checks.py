@@ -9,7 +9,7 @@ relative to the white comes from a lamp that was on for one of the two only.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -42,12 +42,17 @@ FRAMES, BRIGHT, PIXELS = 8, 0.3, 250
 """Number of compared frames; pixels above this fraction of the brightest are used; about this many of a frame."""
 
 
-def check_dark(session: Session, source: Literal["auto"] | WhiteSource = "auto") -> Finding:
+def check_dark(
+    session: Session,
+    source: Literal["auto"] | WhiteSource = "auto",
+    spectra: Mapping[str, Float[np.ndarray, "bands"] | None] | None = None,
+) -> Finding:
     """The finding ``dark``: whether every capture has a dark reference of its integration time, without light.
 
     Args:
         session: its captures.
         source: where the white is.
+        spectra: mean counts of dark references that were already read, by the name of their capture.
 
     Raises:
         InputError: the session does not have that source of white.
@@ -75,7 +80,9 @@ def check_dark(session: Session, source: Literal["auto"] | WhiteSource = "auto")
     with_data, lit = ~unlit_bands(white[None]), {}
     for exposure in exposures:
         assert exposure.dark is not None
-        dark = some_lines(exposure.dark).mean(axis=(0, 1))
+        dark = (spectra or {}).get(exposure.name)
+        if dark is None:
+            dark = some_lines(exposure.dark).mean(axis=(0, 1))
         lit[exposure.name] = light_over_white(dark[with_data], white[with_data])
     values: dict[str, object] = {"light_over_white": {name: round(value, 5) for name, value in lit.items()}}
     shining = [name for name, value in lit.items() if value > LIT_AMBER]
@@ -97,11 +104,16 @@ def check_dark(session: Session, source: Literal["auto"] | WhiteSource = "auto")
     return Finding("dark", "green", "Dark references: every capture has one, without light.", values)
 
 
-def check_lines(session: Session, source: Literal["auto"] | WhiteSource = "auto") -> list[Finding]:
+def check_lines(
+    session: Session,
+    frames: Sequence[Float[np.ndarray, "pixels bands"]],
+    source: Literal["auto"] | WhiteSource = "auto",
+) -> list[Finding]:
     """The finding ``light-lines``, for sessions with narrow bands and a white of their own.
 
     Args:
         session: its captures.
+        frames: counts above dark of brighter pixels of each frame (`bright_pixels`).
         source: where the white is.
 
     Raises:
@@ -114,13 +126,12 @@ def check_lines(session: Session, source: Literal["auto"] | WhiteSource = "auto"
     if found in ("product", "target") or len(wavelengths_nm) < FEWEST_BANDS or np.median(steps_nm) > LARGEST_STEP_NM:
         return []
     cube, dark = white_cubes(session, found)
-    white = _bright_pixels(light_of_some_lines(cube, dark)).mean(axis=0)
+    white = bright_pixels(light_of_some_lines(cube, dark)).mean(axis=0)
     lit = (white >= LEAST_WHITE * white.max()) & cube.good_bands
     if np.count_nonzero(lit) < FEWEST_BANDS:
         return []
     chosen = np.unique(np.linspace(0, len(session.frames) - 1, FRAMES).astype(int)).tolist()
-    frames = [session.frames[number] for number in chosen]
-    spectra = [_bright_pixels(light_of_some_lines(frame.cube, frame.dark))[:, lit] / white[lit] for frame in frames]
+    spectra = [frames[number][:, lit] / white[lit] for number in chosen]
     window = 2 * round(WINDOW_NM / 2.0 / float(np.median(steps_nm))) + 1
     height = line_heights(np.concatenate(spectra), window)
     worst = int(np.abs(height).argmax())
@@ -208,8 +219,9 @@ def line_heights(spectra: Float[np.ndarray, "pixels bands"], window: int) -> Flo
     return np.median(spectra / np.maximum(beside, 1e-6) - 1.0, axis=0)
 
 
-def _bright_pixels(light: Float[np.ndarray, "rows samples bands"]) -> Float[np.ndarray, "pixels bands"]:
+def bright_pixels(light: Float[np.ndarray, "rows samples bands"]) -> Float[np.ndarray, "pixels bands"]:
     """Spectra of the brighter pixels, evenly chosen."""
     brightness = light.mean(axis=-1)
     bright = light[brightness > BRIGHT * np.percentile(brightness, 99.0)]
-    return bright[:: max(1, len(bright) // PIXELS)]
+    # A view would keep all of them in memory.
+    return bright[:: max(1, len(bright) // PIXELS)].copy()

@@ -96,8 +96,8 @@ def inspect_session(
     findings = [
         *check_files(session, skip_damaged),
         *of_white,
-        check_dark(session, white_source),
-        *check_lines(session, white_source),
+        check_dark(session, white_source, {quicklook.name: quicklook.dark_spectrum for quicklook in quicklooks}),
+        *check_lines(session, [quicklook.bright_spectra for quicklook in quicklooks], white_source),
         *check_frames(session, quicklooks, markers.detections),
         *check_markers(session, markers),
         *check_paper(session, quicklooks, markers.detections, white_source),

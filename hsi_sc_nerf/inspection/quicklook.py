@@ -23,6 +23,7 @@ from hsi_sc_nerf.calibration.detector import (
     some_lines,
     spread_rows,
 )
+from hsi_sc_nerf.calibration.reference_checks import bright_pixels
 from hsi_sc_nerf.calibration.white_source import exposure_ratio, panel_reflectance
 from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.poses.session_pictures import edge_slope
@@ -54,6 +55,8 @@ class Quicklook:
         dark_fraction: fraction of the readings without light, by band.
         sharpness_per_px: mean slope of the strongest edges over the picture's contrast.
         digest: hash of the readings; equal for copies only.
+        dark_spectrum: mean counts of the dark reference; None without one.
+        bright_spectra: counts above dark of some of the brighter pixels.
     """
 
     name: str
@@ -63,6 +66,8 @@ class Quicklook:
     dark_fraction: Float[np.ndarray, "bands"]
     sharpness_per_px: float
     digest: str
+    dark_spectrum: Float[np.ndarray, "bands"] | None
+    bright_spectra: Float[np.ndarray, "pixels bands"]
 
     @property
     def gray(self) -> UInt8[np.ndarray, "lines samples"]:
@@ -114,6 +119,8 @@ def quicklook_of(capture: Capture, white: Float[np.ndarray, "bands"]) -> Quicklo
         dark_fraction=(light <= DARK_SIGMAS * noise).mean(axis=(0, 1)),
         sharpness_per_px=sharpness_per_px(picture.mean(axis=-1)),
         digest=hashlib.sha256(np.ascontiguousarray(read).tobytes()).hexdigest(),
+        dark_spectrum=None if dark is None else dark.mean(axis=(0, 1)),
+        bright_spectra=bright_pixels(light),
     )
 
 

@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 from capture_factory import BANDS, DARK, LAMP, SIZE_PX, WAVELENGTHS_NM, write_session
 
-from hsi_sc_nerf.calibration.reference_checks import check_dark, check_lines, light_over_white, line_heights
+from hsi_sc_nerf.calibration.detector import light_of_some_lines
+from hsi_sc_nerf.calibration.reference_checks import (
+    bright_pixels,
+    check_dark,
+    check_lines,
+    light_over_white,
+    line_heights,
+)
 from hsi_sc_nerf.capture.envi import open_cube, write_cube
 from hsi_sc_nerf.capture.session import open_session
 
@@ -58,6 +65,11 @@ def test_a_dark_reference_with_light(folder, name, light, level):
     assert finding.level == level
     assert (name in finding.sentence) == (level != "green")
     assert finding.values["light_over_white"][name] == pytest.approx(light, rel=0.05, abs=0.001)
+
+
+def test_spectra_that_were_read_before_are_taken(folder):
+    opened = open_session(folder)
+    assert check_dark(opened, "auto", {"ball_2": DARK + 0.05 * LAMP, "ball_3": None}).level == "red"
 
 
 def test_bands_without_data_are_no_light(folder):
@@ -157,17 +169,22 @@ def leaf_session(folder, on_white=1.0, on_frames=1.0):
     return open_session(folder)
 
 
+def line_findings(opened, source="auto"):
+    frames = [bright_pixels(light_of_some_lines(frame.cube, frame.dark)) for frame in opened.frames]
+    return check_lines(opened, frames, source)
+
+
 def test_materials_and_lamps_that_both_see_have_no_lines(tmp_path):
-    assert check_lines(leaf_session(tmp_path / "plain"))[0].level == "green"
+    assert line_findings(leaf_session(tmp_path / "plain"))[0].level == "green"
     both = 1.0 + 0.5 * (LINES - 1.0)
-    assert check_lines(leaf_session(tmp_path / "both", both, both))[0].level == "green"
+    assert line_findings(leaf_session(tmp_path / "both", both, both))[0].level == "green"
     # A leaf alone, with its steep edge, before no wall.
     assert np.abs(line_heights(LEAF[None], 15)).max() < 0.025
 
 
 @pytest.mark.parametrize(("strength", "level"), [(0.06, "amber"), (0.4, "red")])
 def test_a_lamp_that_shone_on_the_frames_only(tmp_path, strength, level):
-    (finding,) = check_lines(leaf_session(tmp_path, on_frames=1.0 + strength * (LINES - 1.0)))
+    (finding,) = line_findings(leaf_session(tmp_path, on_frames=1.0 + strength * (LINES - 1.0)))
     assert finding.level == level
     assert "the frames only" in finding.sentence
     assert finding.values["value"] == pytest.approx(strength, rel=0.3)
@@ -175,8 +192,8 @@ def test_a_lamp_that_shone_on_the_frames_only(tmp_path, strength, level):
 
 def test_a_lamp_that_shone_on_the_white_only(tmp_path):
     opened = leaf_session(tmp_path, on_white=1.0 + 0.3 * (LINES - 1.0))
-    assert check_lines(opened, "target") == []  # a target is in the frames' light
-    (finding,) = check_lines(opened)
+    assert line_findings(opened, "target") == []  # a target is in the frames' light
+    (finding,) = line_findings(opened)
     assert finding.level == "red"
     assert "the white only" in finding.sentence
 
@@ -186,7 +203,7 @@ def test_few_broad_bands_tell_nothing(tmp_path):
     for capture in opened.captures:
         for cube in capture.cubes:
             write_cube(cube.header_path, cube.read()[..., ::8], wavelengths_nm=BANDS_NM[::8])
-    assert check_lines(open_session(tmp_path)) == []
+    assert line_findings(open_session(tmp_path)) == []
 
 
 def test_a_real_cube_has_no_lines_where_its_white_is_dark(tmp_path):
@@ -197,4 +214,11 @@ def test_a_real_cube_has_no_lines_where_its_white_is_dark(tmp_path):
     for name, counts in (("a", kernel.read()), ("b", kernel.read()[::-1]), ("white_reference", white.read())):
         write_cube(tmp_path / f"{name}.hdr", counts, wavelengths_nm=kernel.wavelengths_nm)
         write_cube(tmp_path / f"DARKREF_{name}.hdr", dark.read(), wavelengths_nm=kernel.wavelengths_nm)
-    assert check_lines(open_session(tmp_path))[0].level == "green"
+    assert line_findings(open_session(tmp_path))[0].level == "green"
+
+
+def test_few_bright_pixels_keep_no_others_in_memory():
+    light = np.random.default_rng(0).uniform(0.5, 1.0, (16, 512, 8)).astype(np.float32)
+    kept = bright_pixels(light)
+    assert 200 < len(kept) < 600
+    assert kept.base is None

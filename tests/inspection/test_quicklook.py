@@ -40,6 +40,8 @@ def test_markers_in_a_dark_chamber_that_paper_hardly_fills(wall, highlights, exp
         dark_fraction=nothing[0],
         sharpness_per_px=0.0,
         digest="",
+        dark_spectrum=None,
+        bright_spectra=nothing,
     )
     assert sorted(detect_markers(look.gray, "DICT_5X5_50")) == [0, 1]
 
