@@ -4,6 +4,9 @@ Highlights of the lamps move over the turning object, and depend on the normal i
 directions that are mirrored into the camera, their radiance sums to the mirrored fraction times the lamps'
 irradiance: so the highlights tell how much the skin mirrors. The same fraction of the chamber's light is mirrored in
 all views alike, which the views could not tell from the material.
+
+A point that turns through a highlight has too bright a material where other views are few. So highlights and
+corrections of all materials are found together.
 """
 
 from __future__ import annotations
@@ -11,24 +14,30 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import map_coordinates
 
 from hsi_sc_nerf.findings import CERTAIN
 from hsi_sc_nerf.geometry.camera import unit_vectors
 from hsi_sc_nerf.light.shared_errors import CORRELATED
-from hsi_sc_nerf.light.stationary_light import StationaryLight, harmonics
+from hsi_sc_nerf.light.stationary_light import StationaryLight
 from hsi_sc_nerf.light.views import SMALLEST
+from hsi_sc_nerf.robust_scatter import robust_std, tukey_weights
 
 CELL = 0.08
 """Side of the highlights' cells in x and y of the unit normal: 5 degrees for a surface that faces the camera."""
 HALF = int(np.ceil(1.0 / CELL))
 LEAST_MEASUREMENTS = 5
-"""Number of measurements of a cell whose median counts."""
+"""Number of measurements of a cell that counts."""
 HIGHLIGHT_RAD = 0.45
 """Radius of a lamp's highlight in normals: a rough skin before a lamp of 15 degrees has one of 0.35."""
 LEAST_REFLECTANCE = 0.003
 """A skin that mirrors less changes no result."""
+HIGHLIGHT_STD = 0.1
+"""Expected size of a highlight, for cells that the views do not determine."""
+STEPS = 8
+"""Turns of highlights and weights."""
 HIGHLIGHT_ERROR, CHAMBER_ERROR = 0.3, 0.3
 """Relative errors of a highlight at one point, and of the chamber's light that is mirrored there."""
 
@@ -60,7 +69,8 @@ class Gloss:
         Returns:
             The addition, and the standard deviation of its mean over the bands.
         """
-        chamber, highlight = self.reflectance * mirrored_chamber(normals, light), self.highlight(normals)
+        highlight = self.highlight(normals)
+        chamber = np.full(len(normals), self.reflectance * mirrored_chamber(light))
         bands = chamber[:, None] * light.chamber_colour + highlight[:, None] * light.lamp_colour
         return bands, np.hypot(CHAMBER_ERROR * chamber, HIGHLIGHT_ERROR * highlight)
 
@@ -77,41 +87,87 @@ class Gloss:
 
 
 def find_gloss(
-    normals: Float[np.ndarray, "m 3"], residuals: Float[np.ndarray, "m"], light: StationaryLight
+    element: Int[np.ndarray, "m"],
+    normals: Float[np.ndarray, "m 3"],
+    residuals: Float[np.ndarray, "m"],
+    irradiance: Float[np.ndarray, "m"],
+    light: StationaryLight,
 ) -> Gloss | None:
     """The gloss that explains what material and chamber leave of the measurements, or None.
 
     Args:
-        normals: of the measured points of the object, unit vectors in the camera's frame.
+        element: index of the measured element of the object.
+        normals: of the measurements, unit vectors in the camera's frame.
         residuals: measured reflectance less that of the material under its irradiance and less the mirrored light of
             the chamber, means over the bands.
+        irradiance: at the measurements, mean over the bands.
         light: with the lamps whose highlights are looked for.
 
     Example:
-        >>> gloss = find_gloss(normals, (measured - material * irradiance).mean(axis=1), light)
+        >>> residuals = (measured - material[element] * irradiance).mean(axis=1)
+        >>> gloss = find_gloss(element, normals, residuals, irradiance.mean(axis=1), light)
         >>> 0.0 if gloss is None else gloss.reflectance
     """
     if not len(light.lamps):
         return None
-    medians = _cell_medians(_cells(normals), residuals)
-    in_highlights, known = _near_highlights(light), np.isfinite(medians)
-    if not (known & in_highlights).any() or not (known & ~in_highlights).any():
+    cells, near = _cells(normals), _near_highlights(light)
+    known = np.bincount(cells, minlength=near.size) >= LEAST_MEASUREMENTS
+    in_highlights = np.flatnonzero(known & near)
+    if not len(in_highlights) or not (known & ~near).any():
         return None
-    highlights = np.where(known & in_highlights, medians, 0.0)
+    column = np.full(near.size, -1)
+    column[in_highlights] = np.arange(len(in_highlights))
+    highlights, left = _fit_highlights(column[cells], element, residuals, irradiance)
     # A normal's x and y turn by half of what the mirrored direction turns: dw = 4 cos dn, and dn = dx dy / cos.
     unit = 4.0 * CELL**2 / (np.pi * float(light.lamps.sum()))
-    errors = medians[known & ~in_highlights]
+    errors = _cell_medians(cells, left)[known & ~near]
     reflectance = unit * float(highlights.sum())
-    std = unit * float(errors.std() * np.sqrt(CORRELATED * (known & in_highlights).sum()))
+    std = unit * float(errors.std() * np.sqrt(CORRELATED * len(in_highlights)))
     if reflectance < max(LEAST_REFLECTANCE, CERTAIN * std):
         return None
-    return Gloss(reflectance, std, np.maximum(highlights, 0.0))
+    shown = np.zeros(near.size)
+    shown[in_highlights] = np.maximum(highlights, 0.0)
+    return Gloss(reflectance, std, shown.reshape(2 * HALF, 2 * HALF))
 
 
-def mirrored_chamber(normals: Float[np.ndarray, "n 3"], light: StationaryLight) -> Float[np.ndarray, "n"]:
-    """Radiance of the chamber in the direction that a perfect mirror shows to the camera, without its colour."""
-    directions = 2.0 * normals[:, 2:] * normals - np.array([0.0, 0.0, 1.0])
-    return np.maximum(harmonics(directions) @ light.chamber, 0.0)
+def mirrored_chamber(light: StationaryLight) -> float:
+    """Radiance of the chamber that a perfect mirror shows to the camera, without its colour.
+
+    It is the chamber's mean: its unevenness is known too badly. Taken off by direction, it resembles the lamps' light
+    in bands in which the material is dark, and changes their colour.
+    """
+    return max(float(light.chamber[0]), 0.0)
+
+
+def _fit_highlights(
+    column: Int[np.ndarray, "m"],
+    element: Int[np.ndarray, "m"],
+    residuals: Float[np.ndarray, "m"],
+    irradiance: Float[np.ndarray, "m"],
+) -> tuple[Float[np.ndarray, "cells"], Float[np.ndarray, "m"]]:
+    """Highlights by robust least squares, with the materials' corrections eliminated, and what both leave.
+
+    Args:
+        column: the highlights' cell of each measurement, -1 for none.
+    """
+    count, rows = len(column), np.flatnonzero(column >= 0)
+    cells, elements = int(column.max()) + 1, int(element.max()) + 1
+    highlit = scipy.sparse.csr_array((np.ones(len(rows)), (column[rows], rows)), shape=(cells, count))
+    lit = scipy.sparse.csr_array((irradiance, (element, np.arange(count))), shape=(elements, count))
+    weights, scatter = np.ones(count), robust_std(residuals)
+    for _ in range(STEPS):
+        square = np.maximum(lit @ (weights * irradiance), 1e-12)
+        shared = scipy.sparse.csr_array((highlit * weights) @ lit.T)
+        by_material = scipy.sparse.csr_array(shared / square)
+        information = np.diag(highlit @ weights) - (by_material @ shared.T).toarray()
+        information += (scatter / HIGHLIGHT_STD) ** 2 * np.eye(cells)
+        known = highlit @ (weights * residuals) - by_material @ (lit @ (weights * residuals))
+        highlights = np.linalg.solve(information, known)
+        left = residuals - highlit.T @ highlights
+        left -= irradiance * ((lit @ (weights * left)) / square)[element]
+        scatter = robust_std(left)
+        weights = np.maximum(tukey_weights(left / scatter), 1e-6)
+    return highlights, left
 
 
 def _cells(normals: Float[np.ndarray, "m 3"]) -> Int[np.ndarray, "m"]:
@@ -119,7 +175,7 @@ def _cells(normals: Float[np.ndarray, "m 3"]) -> Int[np.ndarray, "m"]:
     return line * 2 * HALF + column
 
 
-def _cell_medians(cells: Int[np.ndarray, "m"], values: Float[np.ndarray, "m"]) -> Float[np.ndarray, "side side"]:
+def _cell_medians(cells: Int[np.ndarray, "m"], values: Float[np.ndarray, "m"]) -> Float[np.ndarray, "cells"]:
     """Median of the values in each cell; NaN where there are few."""
     medians = np.full((2 * HALF) ** 2, np.nan)
     order = np.argsort(cells, kind="stable")
@@ -127,14 +183,14 @@ def _cell_medians(cells: Int[np.ndarray, "m"], values: Float[np.ndarray, "m"]) -
     for cell, start, number in zip(found, first, count, strict=True):
         if number >= LEAST_MEASUREMENTS:
             medians[cell] = np.median(values[order[start : start + number]])
-    return medians.reshape(2 * HALF, 2 * HALF)
+    return medians
 
 
-def _near_highlights(light: StationaryLight) -> Bool[np.ndarray, "side side"]:
+def _near_highlights(light: StationaryLight) -> Bool[np.ndarray, "cells"]:
     """Cells whose normals lie near one that mirrors a lamp into the camera."""
     middles = (np.arange(2 * HALF) - HALF + 0.5) * CELL
     x, y = np.meshgrid(middles, middles)
     square = 1.0 - x**2 - y**2
     normals = np.stack([x, y, np.sqrt(np.maximum(square, 0.0))], axis=-1)
     mirrors = unit_vectors(light.to_lamps + np.array([0.0, 0.0, 1.0]))
-    return ((normals @ mirrors.T).max(axis=-1) > np.cos(HIGHLIGHT_RAD)) & (square > 0.0)
+    return (((normals @ mirrors.T).max(axis=-1) > np.cos(HIGHLIGHT_RAD)) & (square > 0.0)).ravel()

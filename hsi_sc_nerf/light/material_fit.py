@@ -9,7 +9,7 @@ once it is found (`Gloss`); Tukey's weights leave out what is left of it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse
@@ -129,10 +129,13 @@ class MaterialFitting:
         before = 0.0 if self.gloss is None else self.gloss.reflectance
         irradiance = self.irradiance()
         diffuse = self.materials(irradiance)[self.views.element] * irradiance
-        left = (self.views.reflectance - diffuse).mean(axis=1) - before * mirrored_chamber(normals, self.light)
-        found = find_gloss(normals[on_object], left[on_object], self.light)
+        left = (self.views.reflectance - diffuse).mean(axis=1) - before * mirrored_chamber(self.light)
+        element, lit = self.views.element[on_object], irradiance[on_object].mean(axis=1)
+        found = find_gloss(element, normals[on_object], left[on_object], lit, self.light)
         if found is None:
             return False
+        if self.gloss is not None:  # lamps answer to gloss: whole steps swing around the answer
+            found = replace(found, reflectance=(found.reflectance + before) / 2.0)
         self.gloss = found
         reflectance = self.views.reflectance
         matte = found.taken_off(reflectance, normals, self.light)
