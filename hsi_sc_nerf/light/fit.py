@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.geometry.camera import unit_vectors
+from hsi_sc_nerf.light.gloss import CHAMBER_ERROR, mirrored_chamber
 from hsi_sc_nerf.light.material_fit import LightFit, MaterialFitting
 from hsi_sc_nerf.light.shared_errors import CORRELATED, SharedErrors
 from hsi_sc_nerf.light.stationary_light import (
@@ -64,7 +65,7 @@ WHITE_STD = 0.01
 """Error of the white reference's own reflectance and orientation."""
 WHITE_PLACE_STD_M = 0.02
 """Error of the place at which it was captured."""
-COLOUR_STD = 0.3
+COLOUR_STD = 0.1
 """Expected scatter of the lamps' colour from the white reference's light."""
 LEAST_LAMPS = 0.05
 """The lamps' colour is fitted if they give the white reference at least this fraction of its light."""
@@ -280,10 +281,18 @@ class _LightFitting(MaterialFitting):
         expected = self.materials(irradiance)[self.views.element] * irradiance
         chamber, lamps = self.direct()
         slope = (lamps - chamber * of_lamps / of_chamber)[:, None] / irradiance
-        residual, slope = self.without_materials(self.measured / expected - 1.0, slope)
-        weighted = self.precision[:, None] / CORRELATED * slope
-        gain = (weighted * slope).sum(axis=0) + COLOUR_STD**-2
-        step = ((weighted * residual).sum(axis=0) + (1.0 - light.lamp_colour) * COLOUR_STD**-2) / gain
+        gloss = 0.0 if self.gloss is None else CHAMBER_ERROR * self.gloss.reflectance * mirrored_chamber(light)
+        columns = self.measured / expected - 1.0, slope, gloss * self.views.on_object[:, None] / expected
+        residual, slope, gloss_error = self.without_materials(*columns)
+        step = np.empty(len(light.lamp_colour))
+        for band, own in enumerate(slope.T):
+            information, known = self.errors.information(residual[:, band], own[:, None], self.precision)
+            weighted = self.precision * own
+            # All measurements share the error of the mirrored chamber, which is large where the material is dark.
+            by_gloss = (weighted @ gloss_error[:, band]) / max(float(weighted @ own), 1e-12)
+            gain = 1.0 / (1.0 / information[0, 0] + by_gloss**2)
+            pull = gain * known[0] / information[0, 0] + (1.0 - light.lamp_colour[band]) * COLOUR_STD**-2
+            step[band] = pull / (gain + COLOUR_STD**-2)
         # A change that all bands share is one of the lamps' strength.
         colour = np.clip(light.lamp_colour + step - step.mean(), 0.0, 1.0 + of_chamber / of_lamps)
         chamber_colour = 1.0 + (1.0 - colour) * of_lamps / of_chamber
