@@ -83,3 +83,15 @@ def test_a_glossy_ball_gets_the_material_below_its_gloss():
     assert abs(with_gloss - without) < 0.02
     # Left in, the chamber's mirrored half of the light alone would add this much.
     assert 0.06 * 0.5 / np.median(material) > 0.05
+
+
+def test_the_lamps_keep_their_colour_where_a_glossy_ball_is_dark():
+    ball = turning_ball(1500)
+    views, _, _ = measured(ball, 0.5)
+    light = fit_light(ball, views, FACING).light
+    # What is mirrored is brighter by 30 % than the chamber is on average.
+    added = highlight(ball.normals_in_camera(views), light, 0.06) + 1.3 * 0.06 * mirrored_chamber(light)
+    glossy = replace(views, reflectance=views.reflectance * np.array([0.15, 1.0]) + added[:, None])
+    found = fit_light(ball, glossy, FACING)
+    assert found.gloss is not None
+    np.testing.assert_allclose(found.light.lamp_colour, 1.0, atol=0.05)
