@@ -154,7 +154,7 @@ def _fit_highlights(
     cells, elements = int(column.max()) + 1, int(element.max()) + 1
     highlit = scipy.sparse.csr_array((np.ones(len(rows)), (column[rows], rows)), shape=(cells, count))
     lit = scipy.sparse.csr_array((irradiance, (element, np.arange(count))), shape=(elements, count))
-    weights, scatter = np.ones(count), robust_std(residuals)
+    weights, scatter = np.ones(count), robust_std(residuals, least=SMALLEST)
     for _ in range(STEPS):
         square = np.maximum(lit @ (weights * irradiance), 1e-12)
         shared = scipy.sparse.csr_array((highlit * weights) @ lit.T)
@@ -165,8 +165,8 @@ def _fit_highlights(
         highlights = np.linalg.solve(information, known)
         left = residuals - highlit.T @ highlights
         left -= irradiance * ((lit @ (weights * left)) / square)[element]
-        scatter = robust_std(left)
-        weights = np.maximum(tukey_weights(left / scatter), 1e-6)
+        scatter = robust_std(left, least=SMALLEST)
+        weights = np.maximum(tukey_weights(left, scatter), 1e-6)
     return highlights, left
 
 

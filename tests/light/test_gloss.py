@@ -66,6 +66,7 @@ def test_noise_or_light_without_lamps_is_no_gloss():
     assert found_in(normals, noise, light) is None
     assert found_in(normals, noise + highlight(normals, light, 0.05), even_chamber(2)) is None
     assert found_in(normals[:3], noise[:3], light) is None
+    assert found_in(normals, np.zeros(len(normals)), light) is None
 
 
 def test_a_glossy_ball_gets_the_material_below_its_gloss():
