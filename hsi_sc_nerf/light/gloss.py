@@ -133,8 +133,8 @@ def find_gloss(
 def mirrored_chamber(light: StationaryLight) -> float:
     """Radiance of the chamber that a perfect mirror shows to the camera, without its colour.
 
-    It is the chamber's mean: its unevenness is known too badly. Taken off by direction, it resembles the lamps' light
-    in bands in which the material is dark, and changes their colour.
+    It is the chamber's mean: the fitted unevenness is too uncertain. Taken off by direction, it resembles the lamps'
+    light in bands in which the material is dark, and changes their colour.
     """
     return max(float(light.chamber[0]), 0.0)
 
