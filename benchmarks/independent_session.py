@@ -19,7 +19,6 @@ import json
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import tyro
@@ -30,6 +29,7 @@ from path_traced_scene import (
     DICTIONARY,
     MARKER_SIDE_M,
     MATERIALS,
+    Fruit,
     PathTracedScene,
     camera_pose,
     marker_poses,
@@ -94,7 +94,7 @@ class IndependentSession:
     """Width and height of the images, pixels."""
     rays: int = 64
     """Rays in each pixel; fewer make more noise."""
-    fruit: Literal["quince", "long"] = "quince"
+    fruit: Fruit = "quince"
     """Shape of the fruit."""
     seed: int = 0
     """Seed of paths, angles and noise."""

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from open3d.core import Tensor
 from paper_tables import mean_and_deviation
-from path_traced_scene import PathTracedScene, camera_pose, material_reflectance, tarp_reflectance
+from path_traced_scene import Fruit, PathTracedScene, camera_pose, material_reflectance, tarp_reflectance
 from results_table import RESULTS, write_results
 from session_mistakes import measured_errors
 from true_object import relative_rms
@@ -85,7 +85,7 @@ class PathTracedAccuracy:
     """Width and height of the images, pixels."""
     rays: int = 256
     """Rays in each pixel of the session."""
-    fruit: Literal["quince", "long"] = "quince"
+    fruit: Fruit = "quince"
     """Shape of the fruit."""
     preset: Preset = "balanced"
     """Of `hsi-sc-nerf run`."""

@@ -1,4 +1,4 @@
-"""A turntable scene for Mitsuba 3: a glossy lumpy fruit on a white container before a wooden wall, in a white room.
+"""A turntable scene for Mitsuba 3: a glossy fruit on a white container before a wooden wall, in a white room.
 
 It shares no code with our simulator. The fruit turns clockwise under two lamps; markers lie on the disc only. Room
 and camera turn back instead of the disc, which gives the same images.
@@ -25,6 +25,7 @@ MARKERS, MARKER_SIDE_M, MARKER_RADIUS_M = 8, 0.044, 0.101
 DICTIONARY = "DICT_4X4_50"
 DISTANCE_M, ELEVATION_DEG, AIM_M = 0.72, 33.0, np.array([0.0, 0.0, 0.045])
 WALL_BEHIND_M = 0.3
+Fruit = Literal["quince", "long", "ribbed"]
 GLOSS = 0.045
 """Fraction of the fruit's light that is reflected as by rough metal, whatever the wavelength."""
 
@@ -63,7 +64,7 @@ class PathTracedScene:
     """Width and height of the images."""
     rays: int
     """Rays in each pixel; fewer make more noise."""
-    fruit: Literal["quince", "long"] = "quince"
+    fruit: Fruit = "quince"
     """Shape of the fruit."""
     spots: int = 160
     """Number of dark spots on the skin."""
@@ -142,14 +143,20 @@ def stop_angles_deg(frames: int, rng: np.random.Generator) -> Float[np.ndarray, 
     return angles_deg - angles_deg[0]
 
 
-def fruit_mesh(name: str) -> trimesh.Trimesh:
-    """A lumpy fruit on the container's lid that no turn brings on to itself."""
+def fruit_mesh(name: Fruit) -> trimesh.Trimesh:
+    """A fruit on the container's lid that no turn brings on to itself; the ribbed one is flat with a hollow top."""
     ball = trimesh.creation.icosphere(subdivisions=6)
     x, y, z = ball.vertices.T
-    radius = 1.0 + 0.10 * z * (1.0 - z) + 0.06 * x * y + 0.07 * np.exp(-7.0 * (1.0 - x)) - 0.05 * x * z**2
-    radius += 0.03 * np.sin(5.0 * np.arctan2(y, x)) * (1.0 - z**2) ** 2 - 0.25 * np.exp(-14.0 * (1.0 - z))
-    vertices = 0.043 * radius[:, None] * ball.vertices
-    vertices *= [1.0, 0.94, 1.12] if name == "quince" else [0.62, 0.7, 1.35]
+    azimuth = np.arctan2(y, x)
+    if name == "ribbed":
+        ribs = np.abs(np.sin(3.5 * azimuth + 0.4 * np.sin(azimuth))) ** 0.7
+        radius = 0.93 + 0.10 * ribs * (1.0 - z**2) + 0.05 * x * y - 0.32 * np.exp(-9.0 * (1.0 - z))
+        shape = [1.12, 1.05, 0.86]
+    else:
+        radius = 1.0 + 0.10 * z * (1.0 - z) + 0.06 * x * y + 0.07 * np.exp(-7.0 * (1.0 - x)) - 0.05 * x * z**2
+        radius += 0.03 * np.sin(5.0 * azimuth) * (1.0 - z**2) ** 2 - 0.25 * np.exp(-14.0 * (1.0 - z))
+        shape = [1.0, 0.94, 1.12] if name == "quince" else [0.62, 0.7, 1.35]
+    vertices = 0.043 * radius[:, None] * ball.vertices * shape
     # It stands on a flat patch.
     vertices[:, 2] = np.maximum(vertices[:, 2] - vertices[:, 2].min(), 0.002) - 0.002 + CONTAINER_HEIGHT_M
     return trimesh.Trimesh(vertices, ball.faces, process=False)
