@@ -65,8 +65,9 @@ class MaskConfig:
     shaded_fraction: float | None = between(0.0, 10.0, default=0.5)
     """Pixels next to the object and darker than it are added where their score relative to their brightness is more
     than this fraction of the object's; None for none. Not applied next to even darker pixels."""
-    overhang: float = between(0.01, 100.0, default=1.2)
-    """The object may reach beyond the container's lid up to this multiple of the lid's radius."""
+    overhang: float | None = between(0.01, 100.0, default=None)
+    """The object may reach beyond the container's lid up to this multiple of the lid's radius. 1.2 if not given, or
+    1.6 or 2.4 where the object is cut off otherwise."""
     pieces: int = between(1, 1000, default=1)
     """The object consists of up to so many pieces that are apart from each other (two berries, some grains). All of
     them are reconstructed together."""
@@ -173,7 +174,7 @@ def above_lid(
     distortion: Float[np.ndarray, "4"],
     camera_to_world: Float[np.ndarray, "4 4"],
     container: Container,
-    overhang: float = 1.2,
+    overhang: float,
 ) -> Bool[np.ndarray, "h w"]:
     """Pixels whose rays pass through the space above the container's lid before they meet the container.
 

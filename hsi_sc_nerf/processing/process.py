@@ -18,7 +18,7 @@ from hsi_sc_nerf.calibration.report import REPORT_NAME, describe_calibration, dr
 from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, SessionCalibration, calibrate_session
 from hsi_sc_nerf.capture.session import Session, open_session
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.files import require_writable, write_png
+from hsi_sc_nerf.files import require_writable
 from hsi_sc_nerf.inspection.inspect import inspect_session, suggestion
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.packed.dataset import (
@@ -36,20 +36,13 @@ from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.processing.appearance_checks import check_appearance, check_band_order
 from hsi_sc_nerf.processing.chamber import background_spectrum
 from hsi_sc_nerf.processing.effects import draw_effects, measure_effects, points_of_object, show_effects
-from hsi_sc_nerf.processing.frames import BinsOfFrames, FrameCache, is_up_to_date, pack_frames, session_fingerprint
-from hsi_sc_nerf.processing.mask_checks import check_masks
-from hsi_sc_nerf.processing.masks import MaskConfig, above_lid, foreground_masks, lid_middle, mask_picture
+from hsi_sc_nerf.processing.frames import BinsOfFrames, is_up_to_date, pack_frames, session_fingerprint
+from hsi_sc_nerf.processing.masks import MaskConfig
 from hsi_sc_nerf.processing.painted_masks import note_masks
 from hsi_sc_nerf.processing.posed_frames import PoseFunction, container_under, known_camera, pose_frames, posed_frames
 from hsi_sc_nerf.processing.session_checks import SessionChecks, require_checks
-from hsi_sc_nerf.processing.visual_hull import (
-    VotedHull,
-    assumed_disc,
-    object_box,
-    scene_box,
-    size_in_words,
-    voted_hull,
-)
+from hsi_sc_nerf.processing.session_masks import write_masks
+from hsi_sc_nerf.processing.visual_hull import VotedHull, assumed_disc, object_box, scene_box, size_in_words
 from hsi_sc_nerf.settings_file import between, check_options
 from hsi_sc_nerf.spectra import nearest_bands
 
@@ -163,7 +156,9 @@ def process_session(
     caches = [cache for cache, used in zip(caches, poses.used, strict=True) if used]
     frames = posed_frames(output_dir, poses)
     container = container_under(session, poses)
-    masks, hull = _write_masks(caches, frames, poses, container, config.masks, output_dir, console, checks)
+    masks, hull, findings = write_masks(caches, frames, poses, container, config.masks, output_dir / "report")
+    console.print(f"Masks: the object covers {100.0 * masks.mean():.1f} % of the pixels.")
+    checks.add(findings)
     object_box_m, scene_box_m = _boxes(session, hull, poses, container, console)
     wavelengths_nm = session.wavelengths_nm[calibration.bands]
     spectrum, typical = _object_spectrum(frames, masks), None
@@ -257,58 +252,6 @@ def _calibrate(session: Session, config: ProcessConfig, output_dir: Path, consol
     for sentence in describe_calibration(session, calibration):
         console.print(sentence, highlight=False)
     return calibration
-
-
-def _write_masks(
-    caches: Sequence[FrameCache],
-    frames: Sequence[PackedFrame],
-    poses: TurntablePoses,
-    container: Container | None,
-    config: MaskConfig,
-    output_dir: Path,
-    console: Console,
-    checks: SessionChecks,
-) -> tuple[Bool[np.ndarray, "frames h w"], VotedHull]:
-    """Find, write, draw and check the foreground masks of the posed frames; the masks and their visual hull.
-
-    Raises:
-        InputError: a finding is red and not accepted.
-    """
-    regions = lid_middles = None
-    camera_to_worlds, lens = np.stack([frame.camera_to_world for frame in frames]), poses.intrinsics
-    if container is not None:
-        distortion, overhang = np.array(poses.distortion, dtype=float), config.overhang
-        regions = np.stack([above_lid(lens, distortion, pose, container, overhang) for pose in camera_to_worlds])
-        lid_middles = np.stack([lid_middle(lens, pose, container) for pose in camera_to_worlds])
-    bins = BinsOfFrames(caches)
-    masks, left_out = foreground_masks(bins, config, regions)
-    brightness = np.stack([image.mean(axis=0, dtype=np.float32) for image in bins])
-    lid_z_m = None if container is None else container.height_m
-    names = [frame.capture for frame in frames]
-
-    def hull_of(masks: Bool[np.ndarray, "frames h w"]) -> VotedHull:
-        return voted_hull(masks, camera_to_worlds, lens, lid_z_m)
-
-    hull = hull_of(masks)
-    findings = check_masks(
-        masks,
-        names,
-        hull,
-        brightness,
-        left_out,
-        lambda others: hull_of(others).silhouettes,
-        regions,
-        lid_middles,
-    )
-    if all(finding.level != "red" for finding in findings):
-        masks = hull.trim(masks)
-    for frame, mask in zip(frames, masks, strict=True):
-        write_png(frame.mask_path, mask.astype(np.uint8) * 255)
-    images = [frame.pseudo_rgb() for frame in frames]
-    mask_picture(output_dir / "report" / "masks.png", images, list(masks), names)
-    console.print(f"Masks: the object covers {100.0 * masks.mean():.1f} % of the pixels.")
-    checks.add(findings)
-    return masks, hull
 
 
 def _object_spectrum(

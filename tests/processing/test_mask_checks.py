@@ -19,7 +19,7 @@ FRAMES = 12
 POSES = np.stack([true_pose(angle) for angle in np.arange(FRAMES) * 360.0 / FRAMES])
 NAMES = [f"ball_{i}" for i in range(FRAMES)]
 NOTHING = np.zeros(FRAMES, bool)
-REGIONS = np.stack([above_lid(INTRINSICS, np.zeros(4), pose, CONTAINER) for pose in POSES])
+REGIONS = np.stack([above_lid(INTRINSICS, np.zeros(4), pose, CONTAINER, overhang=1.2) for pose in POSES])
 
 
 def ball(pose, offset_m=(0.0, 0.0, 0.0), radius_m=SPHERE_RADIUS_M) -> np.ndarray:

@@ -110,8 +110,8 @@ def test_above_lid_agrees_with_marching_along_the_rays(height):
 def test_above_lid_undoes_lens_distortion():
     pose = true_pose(0.0)
     distortion = np.array([2.0, 0.0, 0.03, 0.0])
-    straight = above_lid(INTRINSICS, NO_DISTORTION, pose, CONTAINER)
-    bent = above_lid(INTRINSICS, distortion, pose, CONTAINER)
+    straight = above_lid(INTRINSICS, NO_DISTORTION, pose, CONTAINER, overhang=1.2)
+    bent = above_lid(INTRINSICS, distortion, pose, CONTAINER, overhang=1.2)
     y, x = np.mgrid[0 : INTRINSICS.h, 0 : INTRINSICS.w]
     rays = np.stack(
         [(x + 0.5 - INTRINSICS.cx) / INTRINSICS.fl_x, (y + 0.5 - INTRINSICS.cy) / INTRINSICS.fl_y, np.ones(x.shape)],
@@ -133,7 +133,7 @@ def test_the_middle_of_the_lid_is_in_the_middle_of_what_may_be_the_objects():
     assert np.hypot(column.mean() + 0.5 - centre[0], row.mean() + 0.5 - centre[1]) < 0.5
     radius_px = INTRINSICS.fl_x * 0.3 * CONTAINER.diameter_m / 2 / np.linalg.norm(pose[:3, 3] - [0, 0, 0.07])
     assert np.ptp(column) + 1 == pytest.approx(2 * radius_px, abs=1.5)
-    assert (middle & above_lid(INTRINSICS, NO_DISTORTION, pose, CONTAINER)).sum() == middle.sum()
+    assert (middle & above_lid(INTRINSICS, NO_DISTORTION, pose, CONTAINER, overhang=1.2)).sum() == middle.sum()
 
 
 def test_mask_picture_draws_each_outline(tmp_path):

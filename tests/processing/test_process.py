@@ -35,7 +35,7 @@ from hsi_sc_nerf.inspection import inspect
 from hsi_sc_nerf.packed.cube import REFLECTANCE_SCALE
 from hsi_sc_nerf.packed.dataset import Container, open_packed
 from hsi_sc_nerf.poses.pose_methods import find_poses
-from hsi_sc_nerf.processing import process
+from hsi_sc_nerf.processing import process, session_masks
 from hsi_sc_nerf.processing.frames import pack_frames
 from hsi_sc_nerf.processing.masks import MaskConfig, foreground_masks
 from hsi_sc_nerf.processing.painted_masks import painted_box
@@ -87,7 +87,7 @@ def test_pictures_of_the_inspection_and_maps_of_frames_are_not_kept(session, tmp
         return found
 
     monkeypatch.setattr(process, "inspect_session", inspected)
-    monkeypatch.setattr(process, "foreground_masks", masked)
+    monkeypatch.setattr(session_masks, "foreground_masks", masked)
     run(session, tmp_path / "data")
     assert mapped == []
 
@@ -359,11 +359,22 @@ def test_another_dataset_is_not_overwritten(session, tmp_path):
 
 
 @pytest.mark.slow
+def test_an_object_wider_than_its_container_is_not_cut_off(tmp_path):
+    session = write_session(tmp_path / "session", ANGLES_DEG, info={**INFO, "container_diameter_m": 0.05})
+    narrow = ProcessConfig(masks=MaskConfig(overhang=1.2))
+    with pytest.raises(InputError, match="--accept masks-cut"):
+        run(session, tmp_path / "narrow", narrow)
+    frames = open_packed(run(session, tmp_path / "data")).frames
+    for frame, angle_deg in zip(frames, ANGLES_DEG, strict=True):
+        assert (frame.mask() ^ sphere_mask(true_pose(angle_deg))).sum() < 0.02 * frame.mask().sum()
+
+
+@pytest.mark.slow
 def test_wrong_masks_are_refused_after_their_picture_is_drawn(session, tmp_path, monkeypatch):
     def everything_above_the_lid(bins, config, regions):
         return regions.copy(), np.zeros(len(regions), bool)
 
-    monkeypatch.setattr(process, "foreground_masks", everything_above_the_lid)
+    monkeypatch.setattr(session_masks, "foreground_masks", everything_above_the_lid)
     with pytest.raises(InputError, match="--accept masks-border"):
         run(session, tmp_path / "data")
     assert (tmp_path / "data" / "report" / "masks.png").is_file()
