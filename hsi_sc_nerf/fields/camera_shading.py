@@ -6,7 +6,7 @@ there, then depends on the normal in the camera's frame, nearly alike for all po
 the viewing direction has to learn each point's highlights from the few views that show them, and guesses the others.
 
 The object and its support (container and disc) are two bodies of different material, and each has a function of its
-own. With one for both, the lowest millimetres of the object come out too far (docs/validation/effects.md).
+own. With one for both, the lowest millimetres of the object come out too far (docs/notes/earlier_measurements.md).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MAP_CHANNELS, HIDDEN = 4, 32
 LIMB = 0.966
 """Length in the image of the unit normals at 75 degrees from the camera's axis. Normals beyond have the shading of
 those. Pixels at the limb also cover what is behind it: shading of their own would take over its colour, and the
-surface come out too far, further with every step (docs/validation/effects.md)."""
+surface come out too far, further with every step (docs/notes/earlier_measurements.md)."""
 LARGEST_LOG_GAIN = 4.0
 """No lamp is 50 times brighter than the chamber's mean; what is more would be a step gone wrong."""
 

@@ -31,7 +31,7 @@ FITTED_MARKERS = 5
 MIRRORED_FRAMES, MORE_IN_MIRROR = 6, 2
 """Number of frames whose mirror images are searched for markers if the images themselves show no turn, and the factor
 by which the mirror images must show more markers."""
-EXPECTED = ((20.0, 0.03, 0.5), (10.0, 0.06, 0.5), (8.0, 0.3, 5.0))
+EXPECTED = ((20.0, 0.04, 0.5), (10.0, 0.05, 0.6), (8.0, 0.5, 6.5))
 """Smallest side of a marker in px, and the largest error of poses in degrees and mm that simulated sessions with such
 markers have (docs/validation/poses.md). Smaller markers are refused."""
 STOOD_STILL = 0.2

@@ -24,7 +24,7 @@ from hsi_sc_nerf.models.spectral_model import SpectralModel
 
 MOST_RISE = 0.7
 """The squared errors of pixels that look at a layer of a cap rise by this fraction at most without it: by up to 0.5
-on tomatoes, and by 1.1 to 22 where the layer is of a real top (docs/validation/surface.md)."""
+on tomatoes, and by 1.9 to 22 where the layer is of a real top (docs/validation/surface.md)."""
 
 
 @torch.no_grad()

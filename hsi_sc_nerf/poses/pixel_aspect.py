@@ -17,7 +17,7 @@ from hsi_sc_nerf.poses.residuals import MarkerResiduals
 from hsi_sc_nerf.poses.turntable import MarkerObservations
 
 ASPECT_AMBER, ASPECT_RED = 0.005, 0.015
-"""Departures from square pixels. One of 0.03 moves poses by a centimetre (docs/validation/sessions.md)."""
+"""Departures from square pixels. One of 0.05 moves poses by three centimetres (docs/validation/sessions.md)."""
 _STEP, _ROUNDS = 0.02, 3
 """Steps of the search for the best spacing (logarithm), and number of its rounds."""
 
