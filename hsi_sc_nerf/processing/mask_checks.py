@@ -14,8 +14,6 @@ from hsi_sc_nerf.findings import Finding, Level, leave_out, names_in_short
 from hsi_sc_nerf.processing.visual_hull import VotedHull
 from hsi_sc_nerf.robust_scatter import robust_std
 
-MASKS_CUT = "masks-cut"
-"""Name of the finding on masks that the space above the lid cuts off."""
 MAX_EMPTY_FRACTION = 0.05
 """Fraction of frames without a mask that is tolerated; the visual hull tolerates as many."""
 MAX_CUT_FRACTION = 0.3
@@ -116,14 +114,14 @@ def _border(masks: Bool[np.ndarray, "n h w"], regions: Bool[np.ndarray, "n h w"]
                 "lines: they are the wall's, or the object is wider than --masks.overhang allows; look at "
                 "report/masks.png."
             )
-            found.append(Finding(MASKS_CUT, "red", sentence, {"lines_fraction": float(np.median(cut))}))
+            found.append(Finding("masks-cut", "red", sentence, {"lines_fraction": float(np.median(cut))}))
         elif (cut > CUT_LINES).mean() > CUT_FRAMES:
             sentence = (
                 f"The masks end at the side of the space above the lid in {(cut > CUT_LINES).sum()} of {len(masks)} "
                 "frames, and what of the object reaches beyond it is cut off; raise --masks.overhang, or set the "
                 "object on the middle of the lid."
             )
-            found.append(Finding(MASKS_CUT, "amber", sentence, {"lines_fraction": float(cut.max())}))
+            found.append(Finding("masks-cut", "amber", sentence, {"lines_fraction": float(cut.max())}))
     return found
 
 

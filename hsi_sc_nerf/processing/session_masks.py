@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_png
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.packed.dataset import Container, PackedFrame
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.processing.frames import BinsOfFrames, FrameCache
-from hsi_sc_nerf.processing.mask_checks import MASKS_CUT, check_masks
+from hsi_sc_nerf.processing.mask_checks import check_masks
 from hsi_sc_nerf.processing.masks import MaskConfig, above_lid, foreground_masks, lid_middle, mask_picture
 from hsi_sc_nerf.processing.visual_hull import VotedHull, voted_hull
 
@@ -32,8 +33,8 @@ class _FoundMasks:
     hull: VotedHull
     findings: list[Finding]
 
-    def names(self) -> list[str]:
-        return [finding.name for finding in self.findings]
+    def cut_off(self) -> bool:
+        return any(finding.name == "masks-cut" for finding in self.findings)
 
     def red(self) -> bool:
         return any(finding.level == "red" for finding in self.findings)
@@ -91,10 +92,19 @@ def write_masks(
         )
         return _FoundMasks(masks, hull, findings)
 
+    def widened(found: _FoundMasks) -> _FoundMasks:
+        for overhang in OVERHANGS[1:]:
+            try:
+                wider = found_within(overhang)
+            except InputError:  # nothing stands out any more: the narrow space is the better one
+                break
+            if not wider.cut_off() and not wider.red():
+                return wider
+        return found
+
     found = found_within(OVERHANGS[0] if config.overhang is None else config.overhang)
-    if config.overhang is None and MASKS_CUT in found.names():
-        wider = (found_within(overhang) for overhang in OVERHANGS[1:])
-        found = next((other for other in wider if MASKS_CUT not in other.names() and not other.red()), found)
+    if config.overhang is None and found.cut_off():
+        found = widened(found)
     masks = found.masks if found.red() else found.hull.trim(found.masks)
     for frame, mask in zip(frames, masks, strict=True):
         write_png(frame.mask_path, mask.astype(np.uint8) * 255)
