@@ -68,16 +68,18 @@ def write_masks(
     bins, names = BinsOfFrames(caches), [frame.capture for frame in frames]
     brightness = np.stack([image.mean(axis=0, dtype=np.float32) for image in bins])
     camera_to_worlds, lens = np.stack([frame.camera_to_world for frame in frames]), poses.intrinsics
+    lid_middles = None
+    if container is not None:
+        lid_middles = np.stack([lid_middle(lens, pose, container) for pose in camera_to_worlds])
 
     def hull_of(masks: Bool[np.ndarray, "frames h w"]) -> VotedHull:
         return voted_hull(masks, camera_to_worlds, lens, None if container is None else container.height_m)
 
     def found_within(overhang: float) -> _FoundMasks:
-        regions = lid_middles = None
+        regions = None
         if container is not None:
             distortion = np.array(poses.distortion, dtype=float)
             regions = np.stack([above_lid(lens, distortion, pose, container, overhang) for pose in camera_to_worlds])
-            lid_middles = np.stack([lid_middle(lens, pose, container) for pose in camera_to_worlds])
         masks, left_out = foreground_masks(bins, config, regions)
         hull = hull_of(masks)
         findings = check_masks(
