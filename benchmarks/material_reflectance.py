@@ -31,7 +31,7 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from results_table import RESULTS, write_results
 from true_object import TrueObject, relative_rms
 
@@ -47,6 +47,7 @@ from hsi_sc_nerf.light.elements import (
 from hsi_sc_nerf.light.fit import WHITE_STD
 from hsi_sc_nerf.light.known_light import KnownLight, read_light
 from hsi_sc_nerf.light.material import centre_in_camera, light_on_object, turning_elements
+from hsi_sc_nerf.light.matte_views import matte_score
 from hsi_sc_nerf.light.of_run import ShadingEvidence, light_of_run, shading_evidence
 from hsi_sc_nerf.light.views import ElementViews
 from hsi_sc_nerf.models.trained_run import open_trained_run
@@ -214,13 +215,16 @@ def judge_true_mesh(
     seen, material = observed(points, of_material=even), observed(points, of_material=True)
     sight = poses[seen.frame, :3, 3] - points.positions[seen.element]
     cosines = (sight * points.normals[seen.element]).sum(axis=1) / np.linalg.norm(sight, axis=1)
-    order = np.lexsort([-cosines, seen.element])
-    point, first = np.unique(seen.element[order], return_index=True)
-    best = order[first]
-    measured, true = seen.reflectance[best], material.reflectance[best]
+    best = best_views(seen.element, cosines)
+    point, measured, true = seen.element[best], seen.reflectance[best], material.reflectance[best]
     where = points.positions[point], points.normals[point], seen.frame[best]
     irradiance, std = found.irradiance(*where)
-    separated = found.material_at(measured, *where, np.arange(measured.shape[1])).spectra
+    highlights, gloss = np.zeros(len(cosines)), found.fit.gloss
+    if gloss is not None:
+        highlights = gloss.highlight(np.einsum("nk,nkj->nj", points.normals[seen.element], poses[seen.frame, :3, :3]))
+    matte = best_views(seen.element, matte_score(cosines, highlights))
+    of_view = points.positions[point], points.normals[point], seen.frame[matte]
+    separated = found.material_at(seen.reflectance[matte], *of_view, np.arange(measured.shape[1])).spectra
     shown = measured.mean(axis=1) / true.mean(axis=1)
     return Judged(evidence, points.positions[point], measured, separated, true, irradiance, std, shown, seconds)
 
@@ -237,7 +241,7 @@ def judge_run(truth: Truth, config: Path, cloud_path: Path, known: KnownLight | 
     frames, xy_px, normals = found.frontal(points)
     where, measured = (points, normals, np.maximum(frames, 0)), cloud.spectra[chosen]
     irradiance, std = found.light.irradiance(*where)
-    separated = found.light.material_at(measured, *where, np.arange(measured.shape[1])).spectra
+    separated = found.material(measured, points, np.arange(measured.shape[1])).spectra
     shown = np.full(len(points), np.nan)
     for index, frame in enumerate(run.manager.train_dataset.frames):
         rows = np.flatnonzero(frames == index)
@@ -249,6 +253,12 @@ def judge_run(truth: Truth, config: Path, cloud_path: Path, known: KnownLight | 
     _, weights, _ = surface.nearest(points)
     true = weights @ surface.endmembers
     return Judged(found.evidence, points, measured, separated, true, irradiance, std, shown, seconds)
+
+
+def best_views(point: Int[np.ndarray, "m"], scores: Float[np.ndarray, "m"]) -> Int[np.ndarray, "seen"]:
+    """Index of the view with the highest score of each point that is seen, by the points' order."""
+    order = np.lexsort([-scores, point])
+    return order[np.unique(point[order], return_index=True)[1]]
 
 
 def frontal_points(elements: Elements, mesh: Mesh) -> Elements:

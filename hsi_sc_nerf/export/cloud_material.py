@@ -1,6 +1,6 @@
 """The material's reflectance: on a cloud, by the light in its run, and from there at any point of the object.
 
-The irradiance in that cloud is that of the view that gave a point its spectrum: the object turns under lamps that
+The irradiance in that cloud is that of the view that gave a point its material: the object turns under lamps that
 stand still. The material's reflectance is the same in all views, so that it is what other points and views get.
 """
 
@@ -91,9 +91,7 @@ def with_material(
     std = np.full(len(cloud), np.nan if found.evidence.shaded else WHITE_STD)
     material, irradiance, gloss = cloud.spectra, np.ones(len(cloud)), {}
     if corrected:
-        points_m = cloud.points.astype(float)
-        frames, _, normals = found.frontal(points_m)
-        at = found.light.material_at(cloud.spectra, points_m, normals, np.maximum(frames, 0), bands)
+        at = found.material(cloud.spectra, cloud.points.astype(float), bands)
         material, irradiance, std = at.spectra, at.irradiance, at.irradiance_std
         gloss = {} if at.gloss is None else {GLOSS: at.gloss}
     names = band_property_names(cloud.wavelengths_nm, "material")

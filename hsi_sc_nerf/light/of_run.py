@@ -20,12 +20,14 @@ from hsi_sc_nerf.light.elements import observe_elements, spread_elements, suppor
 from hsi_sc_nerf.light.known_light import KnownLight
 from hsi_sc_nerf.light.material import (
     ObjectLight,
+    PointMaterial,
     centre_in_camera,
     light_on_object,
     turning_elements,
     white_place,
 )
 from hsi_sc_nerf.light.material_fit import LightFit
+from hsi_sc_nerf.light.matte_views import HIGHLIT, matte_views
 from hsi_sc_nerf.light.views import ElementViews, TurningElements
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.packed.cube import unpack
@@ -33,7 +35,9 @@ from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.processing.view_changes import like_spectra
 from hsi_sc_nerf.surface.depth_renders import DepthRenders, render_depth_maps
 from hsi_sc_nerf.surface.outline_opacity import outline_opacity
+from hsi_sc_nerf.surface.surface_depth import camera_rays, render_object
 from hsi_sc_nerf.surface.surface_points import SurfaceMesh, surface_mesh
+from hsi_sc_nerf.terminal import progress_bar
 
 ELEMENTS, SUPPORT_ELEMENTS = 2000, 800
 """Number of elements on the object and on its support: 2 to 4 mm apart on a fruit."""
@@ -96,6 +100,52 @@ class RunLight:
         where, outward = (torch.from_numpy(array).float().to(device) for array in (points, normals))
         frames, xy_px, _ = self.renders.most_frontal(where, outward)
         return frames.cpu().numpy(), xy_px.cpu().numpy(), normals
+
+    def material(
+        self,
+        reflectance: Float[np.ndarray, "n selected"],
+        points_m: Float[np.ndarray, "n 3"],
+        bands: Int[np.ndarray, "selected"],
+    ) -> PointMaterial:
+        """The material at points of the object, with the light of the view that it is taken from.
+
+        That is the most frontal view. If a highlight lies on the point there, the point is rendered anew in the view
+        that `matte_views` finds.
+
+        Args:
+            reflectance: as measured, in the most frontal views.
+            points_m: object frame.
+            bands: of the run, at which the reflectance is given.
+        """
+        frames, _, normals = self.frontal(points_m)
+        seen, gloss = frames >= 0, self.light.fit.gloss
+        frames = np.maximum(frames, 0)
+        if gloss is not None:
+            in_camera = np.einsum("nk,nkj->nj", normals, self.light.turning.rotations[frames])
+            rows = np.flatnonzero(seen & (gloss.highlight(in_camera) > HIGHLIT))
+            device = self.renders.camera_to_world.device
+            where, outward = (
+                torch.from_numpy(array[rows]).float().to(device) for array in (self.run.to_scene(points_m), normals)
+            )
+            others, xy_px = (column.cpu().numpy() for column in matte_views(self.renders, gloss, where, outward))
+            better = (others >= 0) & (others != frames[rows])
+            rows, frames = rows[better], frames.copy()
+            frames[rows], reflectance = others[better], reflectance.copy()
+            reflectance[rows] = self._rendered(frames[rows], xy_px[better])[:, bands]
+        return self.light.material_at(reflectance, points_m, normals, frames, bands)
+
+    def _rendered(
+        self, frames: Int[np.ndarray, "n"], xy_px: Float[np.ndarray, "n 2"]
+    ) -> Float[np.ndarray, "n bands"]:
+        """The object's reflectance at image points."""
+        model, cameras = self.run.model, self.run.manager.train_dataset.cameras
+        batch, parts = model.config.eval_num_rays_per_chunk, [np.zeros((0, len(model.wavelengths_nm)), np.float32)]
+        with progress_bar("rendering spectra without highlights", "points", len(frames)) as update:
+            for start in range(0, len(frames), batch):
+                rays = camera_rays(cameras, frames[start : start + batch], xy_px[start : start + batch], model.device)
+                parts.append(render_object(model, rays)[1].cpu().numpy())
+                update(min(start + batch, len(frames)))
+        return np.concatenate(parts)
 
 
 def light_of_run(

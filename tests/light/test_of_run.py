@@ -8,6 +8,7 @@ import ball_run
 import capture_factory as factory
 import numpy as np
 import pytest
+import torch
 from light_on_a_ball import FACING, measured, turning_ball
 from plyfile import PlyData
 from random_cloud import random_cloud
@@ -21,9 +22,10 @@ from hsi_sc_nerf.export.formats import write_cloud
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.geometry.camera import pixel_rays
 from hsi_sc_nerf.light.fit import fit_light
-from hsi_sc_nerf.light.gloss import HALF, Gloss
+from hsi_sc_nerf.light.gloss import CELL, HALF, Gloss
 from hsi_sc_nerf.light.known_light import read_light
 from hsi_sc_nerf.light.material import CONTACT_ERROR, CONTACT_M
+from hsi_sc_nerf.light.matte_views import HIGHLIT, LEAST_COSINE, matte_score, matte_views
 from hsi_sc_nerf.light.of_run import RunLight, light_of_run, shading_evidence
 from hsi_sc_nerf.models.trained_run import open_trained_run
 from hsi_sc_nerf.packed.cube import pack, write_packed_cube
@@ -149,6 +151,61 @@ def test_gloss_is_taken_off_before_the_light_and_has_a_column(lit):
     assert told["gloss"] == {"reflectance": 0.04, "std": 0.002}
     assert "mirrors 4.0 ± 0.2 %" in sentences(told)[1]
     assert light_summary(lit, matte, corrected=True)["gloss"] is None
+
+
+def highlit(found):
+    """The same light, with highlights wherever the surface faces the camera within 30 degrees, and their gloss."""
+    middles = (np.arange(2 * HALF) - HALF + 0.5) * CELL
+    frontal = middles**2 + middles[:, None] ** 2 < np.sin(np.deg2rad(30.0)) ** 2
+    gloss = Gloss(0.0, 0.001, np.where(frontal, 0.06, 0.0))
+    return replace(found, light=replace(found.light, fit=replace(found.light.fit, gloss=gloss))), gloss
+
+
+@pytest.mark.slow
+def test_a_point_in_a_highlight_is_rendered_in_a_view_without_it(even):
+    glossy, gloss = highlit(even)
+    cloud, bands = upper_cloud(even, lit=False), np.arange(factory.BANDS)
+    points_m = cloud.points.astype(float)
+    frames, _, normals = glossy.frontal(points_m)
+    rotations = even.light.turning.rotations
+    frontal = gloss.highlight(np.einsum("nk,nkj->nj", normals, rotations[frames]))
+    avoided = frontal > 2.0 * HIGHLIT
+    assert 0.3 < avoided.mean() < 1.0
+    # What the most frontal view showed of such a point counts no more.
+    measured = np.where(avoided[:, None], 0.9, cloud.spectra)
+    material = glossy.material(measured, points_m, bands)
+    matte = material.gloss < 0.5 * frontal
+    assert matte[avoided].mean() > 0.8
+    np.testing.assert_array_equal(measured[avoided & matte], np.float32(0.9))  # not written to
+    shown = material.spectra * material.irradiance[:, None] + material.gloss[:, None]
+    np.testing.assert_allclose(shown[matte & avoided].mean(axis=0), factory.PLANT, rtol=0.02)
+    # Others keep their spectrum and their view.
+    same = frontal == 0.0
+    assert same.any()
+    kept = even.material(measured, points_m, bands)
+    np.testing.assert_allclose(material.irradiance[same], kept.irradiance[same], rtol=1e-5)
+    np.testing.assert_allclose(material.spectra[same], kept.spectra[same], rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_the_view_is_the_best_of_those_that_see_the_point(even):
+    _, gloss = highlit(even)
+    points_m = upper_cloud(even, lit=False).points.astype(float)
+    normals = even.frontal(points_m)[2]
+    where, outward = (torch.from_numpy(array).float() for array in (even.run.to_scene(points_m), normals))
+    frames, xy_px = matte_views(even.renders, gloss, where, outward)
+    scores = []
+    for view, rotation in zip(even.renders.views(where, outward), even.light.turning.rotations, strict=True):
+        highlights = gloss.highlight(normals @ rotation)
+        score = matte_score(view.cosines.numpy(), highlights)
+        scores.append(np.where(view.visible & (view.cosines > LEAST_COSINE), score, -np.inf))
+    none = np.isneginf(scores).all(axis=0)
+    np.testing.assert_array_equal(frames.numpy() == -1, none)
+    best = np.max(scores, axis=0)[~none]
+    np.testing.assert_allclose(np.array(scores)[frames[~none], np.flatnonzero(~none)], best, atol=1e-4)
+    seen = list(even.renders.views(where, outward))
+    expected = np.stack([seen[frame].xy_px[row].numpy() for row, frame in enumerate(frames) if frame >= 0])
+    np.testing.assert_array_equal(xy_px[~none], expected)
 
 
 @pytest.mark.slow
