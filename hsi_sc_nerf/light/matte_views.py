@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from hsi_sc_nerf.light.gloss import Gloss
-from hsi_sc_nerf.surface.depth_renders import DepthRenders
+from hsi_sc_nerf.surface.depth_renders import DepthRenders, FrameView
 
 HIGHLIT = 0.01
 """A highlight that adds less to the reflectance is taken off with an error of a third of this."""
@@ -39,17 +39,13 @@ def matte_views(
         points: in the unit of the renders.
         normals: outward unit normals.
     """
-    best = points.new_full((len(points),), -torch.inf)
-    frames = torch.full((len(points),), -1, device=points.device)
-    xy_px = points.new_zeros(len(points), 2)
-    for index, view in enumerate(renders.views(points, normals)):
+
+    def score(index: int, view: FrameView) -> Float[Tensor, "n"]:
         in_camera = normals @ renders.camera_to_world[index, :3, :3].to(normals)
         highlights = torch.from_numpy(gloss.highlight(in_camera.cpu().numpy())).to(points)
-        score = matte_score(view.cosines, highlights)
-        better = view.visible & (view.cosines > LEAST_COSINE) & (score > best)
-        best = torch.where(better, score, best)
-        frames = torch.where(better, index, frames)
-        xy_px = torch.where(better[:, None], view.xy_px, xy_px)
+        return torch.where(view.cosines > LEAST_COSINE, matte_score(view.cosines, highlights), -torch.inf)
+
+    frames, xy_px, _ = renders.best_views(points, normals, score)
     return frames, xy_px
 
 

@@ -125,12 +125,13 @@ class RunLight:
             rows = np.flatnonzero(seen & (gloss.highlight(in_camera) > HIGHLIT))
             device = self.renders.camera_to_world.device
             where, outward = (
-                torch.from_numpy(array[rows]).float().to(device) for array in (self.run.to_scene(points_m), normals)
+                torch.from_numpy(array).float().to(device)
+                for array in (self.run.to_scene(points_m[rows]), normals[rows])
             )
             others, xy_px = (column.cpu().numpy() for column in matte_views(self.renders, gloss, where, outward))
             better = (others >= 0) & (others != frames[rows])
-            rows, frames = rows[better], frames.copy()
-            frames[rows], reflectance = others[better], reflectance.copy()
+            rows, reflectance = rows[better], reflectance.copy()
+            frames[rows] = others[better]
             reflectance[rows] = self._rendered(frames[rows], xy_px[better])[:, bands]
         return self.light.material_at(reflectance, points_m, normals, frames, bands)
 

@@ -5,7 +5,7 @@ Lengths are in scene units.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,17 +99,38 @@ class DepthRenders:
         The frame is -1 for points that no frame sees, and for those that most frames see beside their masks: points
         of the support close to the object.
         """
-        best = torch.full((len(points),), MIN_COSINE, dtype=points.dtype, device=points.device)
+        balance = torch.zeros(len(points), dtype=torch.long, device=points.device)
+
+        def cosines(_: int, view: FrameView) -> Float[Tensor, "n"]:
+            balance.add_(view.visible.long() - view.beside_mask.long())
+            return view.cosines
+
+        frames, xy_px, best = self.best_views(points, normals, cosines)
+        return torch.where(balance < 0, -1, frames), xy_px, best.clamp_min(MIN_COSINE)
+
+    def best_views(
+        self,
+        points: Float[Tensor, "n 3"],
+        normals: Float[Tensor, "n 3"],
+        score_of: Callable[[int, FrameView], Float[Tensor, "n"]],
+    ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n 2"], Float[Tensor, "n"]]:
+        """The frame that sees each point with the highest score or -1, image coordinates there, the score.
+
+        Args:
+            points: in the unit of the depth maps.
+            normals: outward unit normals.
+            score_of: scores of a frame's view; minus infinity for points that it shall not show.
+        """
+        best = points.new_full((len(points),), -torch.inf)
         frames = torch.full((len(points),), -1, device=points.device)
         xy_px = points.new_zeros(len(points), 2)
-        balance = torch.zeros_like(frames)
         for index, view in enumerate(self.views(points, normals)):
-            better = view.visible & (view.cosines > best)
-            best = torch.where(better, view.cosines, best)
+            score = score_of(index, view)
+            better = view.visible & (score > best)
+            best = torch.where(better, score, best)
             frames = torch.where(better, index, frames)
             xy_px = torch.where(better[:, None], view.xy_px, xy_px)
-            balance += view.visible.long() - view.beside_mask.long()
-        return torch.where(balance < 0, -1, frames), xy_px, best
+        return frames, xy_px, best
 
     def depth_at(self, frame: int, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
         """Distances of points from a frame's camera, and the depth map at them.
