@@ -90,24 +90,35 @@ class Lighting:
         self, hits: Hits, camera_to_world: Float[np.ndarray, "4 4"]
     ) -> tuple[Float[np.ndarray, "pixels colours"], tuple[Colour, ...]]:
         """The light of each pixel as weights of colours, and the colours."""
-        surface, count = self._light.surface, len(hits.ray)
-        chamber = len(self._renderer.materials) - 1
-        at_hits = HitLight(np.ones(count, np.float32), np.zeros(count, np.float32), None, (chamber,))
-        for effect in self._on_view:
-            at_hits = effect.at_hits(hits, at_hits, camera_to_world)
+        chamber, surface = len(self._renderer.materials) - 1, self._light.surface
+        at_hits = self._at_hits(hits, camera_to_world)
         colours = (*self._light.colours, *(colour for colour, _ in at_hits.mirrored))
         light = np.zeros((hits.pixels, len(colours)), np.float32)
-        for factor, lit in ((at_hits.chamber, self._light.chamber_lit), (at_hits.lamp, self._light.lamp_lit)):
-            if factor.any():
-                light[:, : lit.shape[1]] += hits.mix(surface.triangles, len(lit), factor) @ lit
-        light[:, : self._light.chamber_lit.shape[1]] += self._reflected_lamps(hits, camera_to_world)
-        light[:, chamber] = 1.0 - hits.mean(np.ones(count))
+        of_surface = light[:, : len(self._light.colours)]
+        seen = [(hits, 1.0, at_hits)]
+        if at_hits.mirrored_hits is not None:
+            mirrored, fraction = at_hits.mirrored_hits
+            seen.append((mirrored, fraction, self._at_hits(mirrored, camera_to_world)))
+        for there, fraction, lit in seen:
+            for factor, unit in ((lit.chamber, self._light.chamber_lit), (lit.lamp, self._light.lamp_lit)):
+                if factor.any():
+                    weights = there.mix(surface.triangles, len(unit), fraction * factor)
+                    of_surface[:, : unit.shape[1]] += weights @ unit
+            of_surface += self._reflected_lamps(there, fraction, camera_to_world)
+        light[:, chamber] = 1.0 - hits.mean(np.ones(len(hits.ray)))
         for i, (_, mirrored) in enumerate(at_hits.mirrored, start=len(self._light.colours)):
             light[:, i] = hits.mean(mirrored)
         return light, colours
 
+    def _at_hits(self, hits: Hits, camera_to_world: Float[np.ndarray, "4 4"]) -> HitLight:
+        count, chamber = len(hits.ray), len(self._renderer.materials) - 1
+        light = HitLight(np.ones(count, np.float32), np.zeros(count, np.float32), None, (chamber,))
+        for effect in self._on_view:
+            light = effect.at_hits(hits, light, camera_to_world)
+        return light
+
     def _reflected_lamps(
-        self, hits: Hits, camera_to_world: Float[np.ndarray, "4 4"]
+        self, hits: Hits, factor: Float[np.ndarray, "hits"] | float, camera_to_world: Float[np.ndarray, "4 4"]
     ) -> Float[np.ndarray, "pixels colours"] | float:
         """Light of lamps that has met two surfaces or more, as weights of the surface's colours."""
         surface, reflection = self._light.surface, self._light.reflection
@@ -121,7 +132,7 @@ class Lighting:
         for column, colour in enumerate(self._light.colours):
             # Faint colours may be neglected in one light and not in the other.
             weights[:, column] += reflected.get(colour, 0.0)
-        return hits.mix(surface.triangles, len(weights)) @ weights
+        return hits.mix(surface.triangles, len(weights), factor) @ weights
 
 
 @dataclass(frozen=True)
@@ -236,6 +247,7 @@ class HitLight:
         to_lamp: unit direction to the lamp; None without a lamp.
         chamber_colour: colour of the chamber.
         mirrored: mirrored light at each hit and its colour.
+        mirrored_hits: where mirrored rays hit the scene itself, and the mirrored fraction of its light.
     """
 
     chamber: Float[np.ndarray, "hits"]
@@ -243,6 +255,7 @@ class HitLight:
     to_lamp: Float[np.ndarray, "3"] | None
     chamber_colour: Colour
     mirrored: tuple[tuple[Colour, Float[np.ndarray, "hits"]], ...] = ()
+    mirrored_hits: tuple[Hits, Float[np.ndarray, "mirrored"]] | None = None
 
 
 class SurfaceLightEffect(Effect):

@@ -106,6 +106,14 @@ class Hits:
         starts = self.positions()[some] + RAY_START_M * self.facing_normals[some]
         return self.renderer.is_unoccluded(starts, np.broadcast_to(directions, starts.shape))
 
+    def onwards(self, directions: Float[np.ndarray, "n 3"], some: Int[np.ndarray, "n"]) -> Hits:
+        """First hits of rays that start at some of the hits, in the same pixels."""
+        starts = self.positions()[some] + RAY_START_M * self.facing_normals[some]
+        found = self.renderer.cast(starts, directions, self.rays_per_pixel)
+        rays, origins, along = self.ray[some], self.origins.copy(), self.directions.copy()
+        origins[rays], along[rays] = starts, directions
+        return replace(found, origins=origins, directions=along, ray=rays[found.ray])
+
     def mix(
         self,
         triangles: Int[np.ndarray, "t 3"],

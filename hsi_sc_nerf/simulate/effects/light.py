@@ -114,9 +114,9 @@ class Gloss(ViewLightEffect):
     """The object (not its support) has a smooth transparent coat over its matte body.
 
     The coat reflects the fraction F (`fresnel`) of the light and transmits 1 - F to the body and back. It mirrors the
-    chamber where the mirror direction is unoccluded, and nothing elsewhere. A `Lamp` adds a highlight of GGX facets;
-    its light reaches the body through the coat as in Kelemen and Szirmay-Kalos (2001), which is reciprocal and
-    conserves energy. A highlight can be brighter than the white tarp.
+    chamber or what hides it, once. A `Lamp` adds a highlight of GGX facets; its light reaches the body through the
+    coat as in Kelemen and Szirmay-Kalos (2001), which is reciprocal and conserves energy. A highlight can be brighter
+    than the white tarp.
     """
 
     name: ClassVar[str] = "gloss"
@@ -136,7 +136,10 @@ class Gloss(ViewLightEffect):
 
         chamber, lamp, of_chamber = light.chamber.copy(), light.lamp.copy(), np.zeros_like(light.chamber)
         chamber[glossy] *= 1.0 - reflectance
-        of_chamber[glossy] = light.chamber[glossy] * reflectance * hits.is_unoccluded(mirror, glossy)
+        onwards, of_ray = hits.onwards(mirror, glossy), np.zeros(len(hits.directions), np.float32)
+        of_ray[hits.ray[glossy]] = reflectance
+        open_rays = np.isin(hits.ray[glossy], onwards.ray, invert=True)
+        of_chamber[glossy] = light.chamber[glossy] * reflectance * open_rays
         mirrored = [(light.chamber_colour, of_chamber)]
         if light.to_lamp is not None:
             cosine_to_lamp = np.maximum(normals @ light.to_lamp, 0.0)
@@ -145,7 +148,13 @@ class Gloss(ViewLightEffect):
             highlight = np.zeros_like(light.lamp)
             highlight[glossy] = light.lamp[glossy] * np.pi * self.highlight(normals, to_camera, light.to_lamp)
             mirrored.append(((), highlight))
-        return replace(light, chamber=chamber, lamp=lamp, mirrored=(*light.mirrored, *mirrored))
+        return replace(
+            light,
+            chamber=chamber,
+            lamp=lamp,
+            mirrored=(*light.mirrored, *mirrored),
+            mirrored_hits=(onwards, of_ray[onwards.ray]),
+        )
 
     def highlight(
         self,

@@ -280,20 +280,29 @@ def test_fresnel_at_known_angles():
     assert (fresnel(cosine, 1.45) * 2.0 * cosine).mean() == pytest.approx(mean_fresnel(1.45), abs=1e-6)
 
 
-def test_gloss_mirrors_the_chamber_but_not_what_hides_it(still_life):
+def test_gloss_mirrors_the_chamber_and_what_hides_it(still_life):
     black = (still_life.materials.index("chamber"),)
     lighting = Lighting(still_life, [Gloss()])
     origins = np.array([[0.3, 0.0, 0.05 + RADIUS_M], [0.3, 0.0, 0.05 + 0.3 * RADIUS_M], [0.3, 0, 0.02]], np.float32)
-    hits = lighting._renderer.cast(origins, np.broadcast_to([-1.0, 0.0, 0.0], (3, 3)).astype(np.float32), 1)
+    hits = still_life.cast(origins, np.broadcast_to([-1.0, 0.0, 0.0], (3, 3)).astype(np.float32), 1)
     weights, colours = lighting.light(hits, np.eye(4))
     assert colours[-1] == black
-    body, mirrored = weights[:, :-2].sum(axis=1), weights[:, -1]
-    at_normal = (0.45 / 2.45) ** 2
+    names = still_life.materials
+    of_object, of_support = (
+        weights[:, [names.index(name) for name in pair]].sum(axis=1) for pair in (("red", "green"), ("drum", "table"))
+    )
+    chamber, at_normal = weights[:, -1], (0.45 / 2.45) ** 2
     # At the ball's equator; low on it, where it mirrors the drum or the table; and on the drum, which has no gloss.
-    assert (body[0], mirrored[0]) == (pytest.approx(1 - at_normal, abs=1e-4), pytest.approx(at_normal, abs=1e-4))
-    assert mirrored[1] == 0.0
-    assert body[1] < 1 - at_normal
-    assert (body[2], mirrored[2]) == (1.0, 0.0)
+    assert (of_object[0], chamber[0]) == (pytest.approx(1 - at_normal, abs=1e-4), pytest.approx(at_normal, abs=1e-4))
+    assert of_support[0] == chamber[1] == 0.0
+    assert of_object[1] < 1 - at_normal
+    assert of_support[1] == pytest.approx(1.0 - of_object[1], abs=1e-6)
+    assert (of_support[2], chamber[2]) == (1.0, 0.0)
+
+
+def test_in_a_white_furnace_glossy_neighbours_cannot_be_seen(still_life):
+    """What the coat keeps from the body it mirrors, of the chamber or of the other parts."""
+    np.testing.assert_allclose(if_white(*picture(still_life, [InterReflection(16), Gloss()])), 1.0, atol=2e-3)
 
 
 # Two effects together are what their definitions say
@@ -322,19 +331,27 @@ def test_lamp_with_an_effect_of_the_chamber_is_the_sum_of_both_lights(still_life
 
 
 @pytest.mark.parametrize("baked", [ChamberShading(16), InterReflection(16)], ids=lambda e: e.name)
-def test_gloss_dims_what_the_chamber_effects_give_and_adds_the_same_mirror(still_life, baked):
-    place = look_at([0.35, 0.0, 0.25], [0.0, 0.0, 0.05])
-
-    def one_ray_a_pixel(effects):
-        rendering = render(still_life, CAMERA, place, 1, lighting=Lighting(still_life, effects))
-        return dict(zip(rendering.colours, np.moveaxis(rendering.light_weights, -1, 0), strict=True)), rendering
-
-    both, _ = one_ray_a_pixel([baked, Gloss()])
-    alone, rendering = one_ray_a_pixel([baked])
-    gloss = render(still_life, CAMERA, place, 1, lighting=Lighting(still_life, [Gloss()])).light_weights
-    body = gloss[..., : len(still_life.materials) - 1].sum(axis=-1)
-    object_only = rendering.coverage > 0.0
-    wall = (len(still_life.materials) - 1,)
-    for colour in set(both) - {wall}:
-        np.testing.assert_allclose(both[colour], np.where(object_only, body, 1.0) * alone[colour], atol=1e-5)
-    np.testing.assert_allclose(both[wall], gloss[..., -1], atol=1e-6)
+def test_gloss_dims_what_the_chamber_effects_give_and_mirrors_it(still_life, baked):
+    place, coat = look_at([0.35, 0.0, 0.25], [0.0, 0.0, 0.05]), Gloss()
+    hits = next(still_life.camera_hits(CAMERA, place, 1))[1]
+    matte, both = (Lighting(still_life, [baked, *effects]) for effects in ([], [coat]))
+    seen, colours = both.light(hits, place)
+    alone, _ = matte.light(hits, place)
+    # Slow reference, one ray at a time.
+    expected = np.hstack([alone, np.zeros((len(alone), 1))])
+    for i in np.flatnonzero(hits.is_object):
+        normal, to_camera = hits.facing_normals[i], -hits.directions[hits.ray[i]]
+        mirrored = fresnel(normal @ to_camera, coat.refractive_index)
+        start = (hits.positions()[i] + 2e-5 * normal).astype(np.float32)
+        direction = (2.0 * (normal @ to_camera) * normal - to_camera).astype(np.float32)
+        there = matte.light(still_life.cast(start[None], direction[None], 1), place)[0][0]
+        body = (1.0 - mirrored) * alone[hits.pixel[i]]
+        if there[len(still_life.materials) - 1] == 1.0:
+            expected[hits.pixel[i]] = [*body, mirrored]
+        else:
+            # The coat of a mirrored part would dim it, but a convex ball does not mirror itself.
+            expected[hits.pixel[i]] = [*(body + mirrored * there), 0.0]
+    assert colours[:-1] == matte.light(hits, place)[1]
+    np.testing.assert_allclose(seen, expected, atol=2e-4)
+    assert (expected[:, -1] > 0.0).any()
+    assert (expected[:, : alone.shape[1]] > alone + 0.01).any()  # of the support
