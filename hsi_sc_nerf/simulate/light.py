@@ -95,15 +95,14 @@ class Lighting:
         colours = (*self._light.colours, *(colour for colour, _ in at_hits.mirrored))
         light = np.zeros((hits.pixels, len(colours)), np.float32)
         of_surface = light[:, : len(self._light.colours)]
-        seen = [(hits, 1.0, at_hits)]
+        seen = [(hits, np.ones(len(hits.ray)), at_hits)]
         if at_hits.mirrored_hits is not None:
-            mirrored, fraction = at_hits.mirrored_hits
-            seen.append((mirrored, fraction, self._at_hits(mirrored, camera_to_world)))
+            onwards, fraction = at_hits.mirrored_hits
+            seen.append((onwards, fraction, self._at_hits(onwards, camera_to_world)))
         for there, fraction, lit in seen:
             for factor, unit in ((lit.chamber, self._light.chamber_lit), (lit.lamp, self._light.lamp_lit)):
                 if factor.any():
-                    weights = there.mix(surface.triangles, len(unit), fraction * factor)
-                    of_surface[:, : unit.shape[1]] += weights @ unit
+                    of_surface += there.mix(surface.triangles, len(unit), fraction * factor) @ unit
             of_surface += self._reflected_lamps(there, fraction, camera_to_world)
         light[:, chamber] = 1.0 - hits.mean(np.ones(len(hits.ray)))
         for i, (_, mirrored) in enumerate(at_hits.mirrored, start=len(self._light.colours)):
@@ -118,7 +117,7 @@ class Lighting:
         return light
 
     def _reflected_lamps(
-        self, hits: Hits, factor: Float[np.ndarray, "hits"] | float, camera_to_world: Float[np.ndarray, "4 4"]
+        self, hits: Hits, factor: Float[np.ndarray, "hits"], camera_to_world: Float[np.ndarray, "4 4"]
     ) -> Float[np.ndarray, "pixels colours"] | float:
         """Light of lamps that has met two surfaces or more, as weights of the surface's colours."""
         surface, reflection = self._light.surface, self._light.reflection
