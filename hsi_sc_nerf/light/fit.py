@@ -171,7 +171,7 @@ class _LightFitting(MaterialFitting):
         # The disc hides what shines from below its plane; an upright body would hardly tell it from light from above.
         up = self.elements.rotations[:, 2].mean(axis=0)
         directions = directions[(directions[:, 2] > BEHIND) & (directions @ up > 0.0)]
-        units = self.elements.lamps_at(self.views, directions).irradiance
+        units = self.elements.by_each_lamp(self.views, directions)
         residual, jacobian = self.linearised()
         expected = 1.0 / self.irradiance().mean(axis=1, keepdims=True)
         residual, columns, others = self.without_materials(residual[:, None], units * expected, jacobian)

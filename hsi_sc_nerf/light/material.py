@@ -93,8 +93,8 @@ class ObjectLight:
         for frame in np.unique(frames):
             rows = np.flatnonzero(frames == frame)
             light, material = self.spectral.light, self.spectral.material
-            whole = self.turning.direct(light, int(frame))
-            whole = whole + self.turning.bounced(light, material, int(frame))
+            bounced = self.turning.bounced(light, material, np.array([frame]))[:, 0]
+            whole = self.turning.direct(light, int(frame)) + bounced
             result[rows] = np.einsum("nk,nkb->nb", weights[rows], whole[nearest[rows]])
         result = np.maximum(result, LEAST_IRRADIANCE)
         relative = np.sqrt((weights * self._relative_variance[nearest]).sum(axis=1))

@@ -146,14 +146,10 @@ class MaterialFitting:
 
     def bounce(self) -> None:
         """Irradiance at the measurements by other elements, from the light and materials of now."""
+        frames, which = np.unique(self.views.frame, return_inverse=True)
         for _ in range(1 if self.bounced.any() else 2):
             material = self.materials(self.irradiance())
-            bounced = np.zeros_like(self.bounced)
-            for frame in np.unique(self.views.frame):
-                rows = np.flatnonzero(self.views.frame == frame)
-                arriving = self.elements.bounced(self.light, material, int(frame))
-                bounced[rows] = arriving[self.views.element[rows]]
-            self.bounced = bounced
+            self.bounced = self.elements.bounced(self.light, material, frames)[self.views.element, which]
 
     def linearised(self) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m parameters"]]:
         """Relative residuals, and relative derivatives of the expected values by the light's parameters.

@@ -22,6 +22,8 @@ from hsi_sc_nerf.light.stationary_light import (
 RAYS_AT_ONCE = 1 << 21
 BOUNCES = 4
 """Diffuse reflections between elements that are followed."""
+FAINT = 1e-6
+"""Directions of less radiance than this, relative to the brightest one, are left out: a lamp fills few of them."""
 SMALLEST = 1e-3
 """Reflectance that noise does not exceed."""
 CELLS_ACROSS = 4
@@ -52,7 +54,7 @@ class Transfer:
     def mean(self, weights: scipy.sparse.csr_array) -> Transfer:
         """Means over points, weighted by each row."""
         means = np.asarray(weights @ self.open_weights, np.float32)
-        return Transfer(means, scipy.sparse.csr_array(weights @ self.form_factors))
+        return Transfer(means, scipy.sparse.csr_array(weights @ self.form_factors).astype(np.float32))
 
 
 def transfer(
@@ -154,28 +156,36 @@ class TurningElements:
 
     def direct(self, light: StationaryLight, frame: int) -> Float[np.ndarray, "n bands"]:
         """Irradiance of all elements in a frame by chamber and lamps alone."""
-        weights, to_lamps = self.transfer.open_weights, light.to_lamps @ self.rotations[frame].T
-        chamber = weights @ (self._harmonics[frame] @ light.chamber).astype(np.float32)
-        lamps = weights @ lobes(self.directions, to_lamps).astype(np.float32)
+        to_lamps = light.to_lamps @ self.rotations[frame].T
+        chamber = self._chamber[frame] @ light.chamber.astype(np.float32)
+        lamps = self._by_radiance(lobes(self.directions, to_lamps))
         lamps = lamps * (1.0 + light.nearness * relative_nearness(self.positions, self.normals, to_lamps))
         return chamber[:, None] * light.chamber_colour + (lamps @ light.lamps)[:, None] * light.lamp_colour
 
     def bounced(
-        self, light: StationaryLight, material: Float[np.ndarray, "n bands"], frame: int
-    ) -> Float[np.ndarray, "n bands"]:
-        """Irradiance of all elements in a frame by each other, after up to `BOUNCES` diffuse reflections."""
-        direct = self.direct(light, frame).astype(np.float32)
-        material = material.astype(np.float32)
+        self, light: StationaryLight, material: Float[np.ndarray, "n bands"], frames: Int[np.ndarray, "some"]
+    ) -> Float[np.ndarray, "n some bands"]:
+        """Irradiance of all elements in some frames by each other, after up to `BOUNCES` diffuse reflections."""
+        direct = np.stack([self.direct(light, int(frame)).astype(np.float32) for frame in frames], axis=1)
+        material = material[:, None].astype(np.float32)
         arriving = np.zeros_like(direct)
         for _ in range(BOUNCES):
-            arriving = self.transfer.form_factors @ (material * (direct + arriving))
+            leaving = (material * (direct + arriving)).reshape(len(direct), -1)
+            arriving = (self.transfer.form_factors @ leaving).reshape(direct.shape)
         return arriving
 
     def chamber_at(self, views: ElementViews) -> Float[np.ndarray, "m terms"]:
         """Direct irradiance at measurements by each harmonic."""
-        units = np.empty((len(views.element), self._harmonics[0].shape[1]), np.float32)
+        return self._chamber[views.frame, views.element]
+
+    def by_each_lamp(
+        self, views: ElementViews, to_lamps: Float[np.ndarray, "lamps 3"]
+    ) -> Float[np.ndarray, "m lamps"]:
+        """Direct irradiance at measurements by each of some lamps of strength 1 at infinity."""
+        units = np.empty((len(views.element), len(to_lamps)), np.float32)
         for frame, rows in _by_frame(views):
-            units[rows] = self.transfer.open_weights[views.element[rows]] @ self._harmonics[frame]
+            there = lobes(self.directions, to_lamps @ self.rotations[frame].T)
+            units[rows] = self._by_radiance(there)[views.element[rows]]
         return units
 
     def lamps_at(self, views: ElementViews, to_lamps: Float[np.ndarray, "lamps 3"]) -> LampUnits:
@@ -188,7 +198,7 @@ class TurningElements:
             radiance = lobes(self.directions, there)
             slope = np.einsum("ltk,dk->dlt", along, self.directions) / LOBE_WIDTH_RAD**2
             columns = np.hstack([radiance, (radiance[..., None] * slope).reshape(len(radiance), -1)])
-            units[rows, : 3 * lamps] = self.transfer.open_weights[seen] @ columns.astype(np.float32)
+            units[rows, : 3 * lamps] = self._by_radiance(columns)[seen]
             units[rows, 3 * lamps :] = relative_nearness(self.positions[seen], self.normals[seen], there)
         irradiance = units[:, :lamps]
         by_direction = units[:, lamps : 3 * lamps].reshape(count, lamps, 2)
@@ -208,9 +218,23 @@ class TurningElements:
         """The normal of each measurement in the camera's frame."""
         return np.einsum("mk,mkj->mj", self.normals[views.element], self.rotations[views.frame])
 
+    def _by_radiance(self, radiance: Float[np.ndarray, "directions columns"]) -> Float[np.ndarray, "n columns"]:
+        """Irradiance of all elements by radiance from the given directions."""
+        largest = np.abs(radiance).max(axis=1, initial=0.0)
+        bright = np.flatnonzero(largest > FAINT * largest.max())
+        return self._by_direction[bright].T @ radiance[bright].astype(np.float32)
+
     @cached_property
-    def _harmonics(self) -> list[Float[np.ndarray, "directions terms"]]:
-        return [harmonics(self.directions @ rotation).astype(np.float32) for rotation in self.rotations]
+    def _by_direction(self) -> Float[np.ndarray, "directions n"]:
+        """The transfer's open weights, those of a direction side by side."""
+        return np.ascontiguousarray(self.transfer.open_weights.T)
+
+    @cached_property
+    def _chamber(self) -> Float[np.ndarray, "frames n terms"]:
+        """Direct irradiance of all elements in each frame by each harmonic."""
+        weights = self.transfer.open_weights
+        turned = (harmonics(self.directions @ rotation).astype(np.float32) for rotation in self.rotations)
+        return np.stack([weights @ radiance for radiance in turned])
 
 
 def _cell_numbers(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
