@@ -38,6 +38,9 @@ HIGHLIGHT_STD = 0.1
 """Expected size of a highlight, for cells that the views do not determine."""
 STEPS = 8
 """Turns of highlights and weights."""
+REFLECTANCE_ERROR = 0.2
+"""Relative error of the mirrored fraction by those of the lamps' strength and of the normals, which all highlights
+share (docs/validation/light.md)."""
 HIGHLIGHT_ERROR, CHAMBER_ERROR = 0.3, 0.3
 """Relative errors of a highlight at one point, and of the chamber's light that is mirrored there."""
 
@@ -122,9 +125,10 @@ def find_gloss(
     unit = 4.0 * CELL**2 / (np.pi * float(light.lamps.sum()))
     errors = _cell_medians(cells, left)[known & ~near]
     reflectance = unit * float(highlights.sum())
-    std = unit * float(errors.std() * np.sqrt(CORRELATED * len(in_highlights)))
-    if reflectance < max(LEAST_REFLECTANCE, CERTAIN * std):
+    noise = unit * float(errors.std() * np.sqrt(CORRELATED * len(in_highlights)))
+    if reflectance < max(LEAST_REFLECTANCE, CERTAIN * noise):
         return None
+    std = float(np.hypot(noise, REFLECTANCE_ERROR * reflectance))
     shown = np.zeros(near.size)
     shown[in_highlights] = np.maximum(highlights, 0.0)
     return Gloss(reflectance, std, shown.reshape(2 * HALF, 2 * HALF))
