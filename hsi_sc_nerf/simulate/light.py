@@ -99,11 +99,13 @@ class Lighting:
         if at_hits.mirrored_hits is not None:
             onwards, fraction = at_hits.mirrored_hits
             seen.append((onwards, fraction, self._at_hits(onwards, camera_to_world)))
+        of_lamps = self._reflected_lamps(camera_to_world)
         for there, fraction, lit in seen:
             for factor, unit in ((lit.chamber, self._light.chamber_lit), (lit.lamp, self._light.lamp_lit)):
                 if factor.any():
                     of_surface += there.mix(surface.triangles, len(unit), fraction * factor) @ unit
-            of_surface += self._reflected_lamps(there, fraction, camera_to_world)
+            if of_lamps is not None:
+                of_surface += there.mix(surface.triangles, len(of_lamps), fraction) @ of_lamps
         light[:, chamber] = 1.0 - hits.mean(np.ones(len(hits.ray)))
         for i, (_, mirrored) in enumerate(at_hits.mirrored, start=len(self._light.colours)):
             light[:, i] = hits.mean(mirrored)
@@ -116,14 +118,12 @@ class Lighting:
             light = effect.at_hits(hits, light, camera_to_world)
         return light
 
-    def _reflected_lamps(
-        self, hits: Hits, factor: Float[np.ndarray, "hits"], camera_to_world: Float[np.ndarray, "4 4"]
-    ) -> Float[np.ndarray, "pixels colours"] | float:
-        """Light of lamps that has met two surfaces or more, as weights of the surface's colours."""
+    def _reflected_lamps(self, camera_to_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "p colours"] | None:
+        """Light of lamps that leaves the surface after two reflections or more, as weights of its colours."""
         surface, reflection = self._light.surface, self._light.reflection
         by_lamps = [effect.on_points(surface, camera_to_world) for effect in self._on_view]
         if reflection is None or not any(np.any(lit) for lit in by_lamps):
-            return 0.0
+            return None
         materials = self._light.materials
         leaving = materials * np.asarray(sum(by_lamps), np.float32)[:, None]
         reflected = reflection(_single_colours(self._renderer), leaving, materials)
@@ -131,7 +131,7 @@ class Lighting:
         for column, colour in enumerate(self._light.colours):
             # Faint colours may be neglected in one light and not in the other.
             weights[:, column] += reflected.get(colour, 0.0)
-        return hits.mix(surface.triangles, len(weights), factor) @ weights
+        return weights
 
 
 @dataclass(frozen=True)
