@@ -16,7 +16,6 @@ from torch import Tensor
 from hsi_sc_nerf.morphology import beside
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE
 from hsi_sc_nerf.packed.dataset import PackedFrame
-from hsi_sc_nerf.packed.pixels import PARTLY_FREE
 
 MAX_MEMORY_FRACTION = 0.5
 """Cubes are kept on a GPU if they fill at most this fraction of its free memory."""
@@ -63,8 +62,7 @@ class DevicePixels:
         frame, line, sample = indices.unbind(dim=-1)
         counts = self._counts[frame, line, sample].int().bitwise_and_(0xFFFF)
         mask, partial = (table[frame, line, sample, None] for table in (self._masks, self._partly_covered))
-        free = torch.where(partial, PARTLY_FREE, 1.0) * ~mask
-        batch = {"indices": indices, "mask": mask, "free": free}
+        batch = {"indices": indices, "mask": mask, "free": ~(mask | partial)}
         if not self.has_flagged:
             return batch | {"spectral": counts.float() / self._scale}
         valid = counts != FLAGGED

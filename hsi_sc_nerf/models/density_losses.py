@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hsi_sc_nerf.models.occupancy_sampler import OccupancySampler
@@ -28,19 +28,19 @@ def mean_distortion(sampler: OccupancySampler, outputs: dict[str, Any], pixels: 
 
 
 def mean_free_space(
-    sampler: OccupancySampler, outputs: dict[str, Any], free: Float[Tensor, "pixels"], support_height: float
+    sampler: OccupancySampler, outputs: dict[str, Any], free: Bool[Tensor, "pixels"], support_height: float
 ) -> Float[Tensor, ""]:
     """`free_space_loss`, mean over all pixels.
 
     Args:
         sampler: of the rays.
         outputs: the model's, in training.
-        free: how much each pixel counts as free of the object.
+        free: which pixels show nothing of the object.
         support_height: scene units.
     """
     (*_, weights), (*_, samples) = outputs["weights_list"], outputs["ray_samples_list"]
     heights = samples.frustums.get_positions()[..., 2] - support_height
-    return free_space_loss(weights[..., 0], heights, _of_sampled_rays(sampler, outputs, free)) / len(free)
+    return free_space_loss(weights[..., 0], heights, _of_sampled_rays(sampler, outputs, free.to(weights))) / len(free)
 
 
 def support_softness(dataset: PackedDataset, object_box: Float[Tensor, "2 3"]) -> float:
@@ -83,12 +83,12 @@ def free_space_loss(
     """Weight above the support, summed over the rays that pass the object by and reach its support.
 
     There is nothing but air above the support beside the object. The spectra do not tell: matter of the support's own
-    spectrum in front of it changes no pixel. Pixels that the object covers partly count less: it may be there.
+    spectrum in front of it changes no pixel.
 
     Args:
         weights: weights of the samples.
         heights: heights of the samples above the support, in any unit.
-        free: how much the ray's pixel counts as free of the object: 0 on the object, 1 beside it.
+        free: how much the ray counts: 0 if its pixel may show the object, otherwise its part of the pixel.
 
     Example:
         >>> free_space_loss(torch.tensor([[0.3, 0.7]]), torch.tensor([[0.01, -0.01]]), torch.ones(1))

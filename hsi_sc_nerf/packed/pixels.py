@@ -17,9 +17,6 @@ from hsi_sc_nerf.packed.cube import unpack, unpack_unflagged
 
 BOUNDARY_PX = 3
 """Width of the band of background pixels along the foreground, which decide where the object ends."""
-PARTLY_FREE = 0.3
-"""How much a background pixel that touches the foreground counts as free of the object, which may cover up to half of
-it (docs/validation/surface.md)."""
 
 
 class PixelReader:
@@ -172,14 +169,13 @@ class PixelSampler:
 
         Returns:
             ``indices`` (count, 3) int64; ``spectral`` (count, bands) float32, reflectance; ``mask`` (count, 1) bool,
-            foreground; ``free`` (count, 1) float32, how much the pixel counts as free of the object, in [0, 1]; and,
-            if the cubes have flagged values, ``valid`` (count, bands) bool, which of ``spectral`` were measured (the
-            others are 0).
+            foreground; ``free`` (count, 1) bool, neither foreground nor beside it, where the object may cover a part
+            of the pixel; and, if the cubes have flagged values, ``valid`` (count, bands) bool, which of ``spectral``
+            were measured (the others are 0).
         """
         frame, line, sample = indices.T
         mask, partial = (table[frame, line, sample, None] for table in (self.masks, self._partly_covered))
-        free = np.where(mask, np.float32(0.0), np.where(partial, np.float32(PARTLY_FREE), np.float32(1.0)))
-        batch = {"indices": indices, "mask": mask, "free": free}
+        batch = {"indices": indices, "mask": mask, "free": ~(mask | partial)}
         counts = self.reader.read(indices)
         if not self._has_flagged:
             return batch | {"spectral": unpack_unflagged(counts)}
