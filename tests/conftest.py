@@ -108,6 +108,21 @@ def device(request):
 
 
 @pytest.fixture(scope="module")
+def quick_start():
+    """Training begins in tenths of a second: with a coarse grid, and a field that is taught to be solid in few steps.
+
+    For tests of what comes after; models/test_occupancy_sampler.py tests how a field begins.
+    """
+    from hsi_sc_nerf.fields import occupancy_grid
+    from hsi_sc_nerf.fields.spectral_field import SpectralField
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(occupancy_grid, "GRID_CELLS", 32)
+        patch.setattr(SpectralField.start_solid, "__defaults__", (8,))
+        yield
+
+
+@pytest.fixture(scope="module")
 def browser():
     """For the tests that look at pages as users do."""
     from headless_browser import launch

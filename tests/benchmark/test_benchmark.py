@@ -34,6 +34,8 @@ from hsi_sc_nerf.cli.benchmark import BenchmarkCommand
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_png
 
+pytestmark = pytest.mark.usefixtures("quick_start")
+
 TINY = " ".join(
     (
         "--pipeline.datamanager.train-num-rays-per-batch 64",

@@ -9,6 +9,8 @@ from torch.amp.grad_scaler import GradScaler
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.models.optimizers import GuardedOptimizers, MuonOptimizerConfig
 
+pytestmark = pytest.mark.usefixtures("quick_start")
+
 
 def optimizers():
     groups = {name: [torch.nn.Parameter(torch.ones(3))] for name in ("fields", "camera_opt")}

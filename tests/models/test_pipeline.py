@@ -18,6 +18,8 @@ from hsi_sc_nerf.models.pipeline import SpectralPipeline, digest_of_frames
 from hsi_sc_nerf.packed.cube import FLAGGED
 from hsi_sc_nerf.packed.dataset import open_packed, write_transforms
 
+pytestmark = pytest.mark.usefixtures("quick_start")
+
 
 def view(pixels, valid=None):
     shown = torch.zeros(2, 2, 1)

@@ -12,6 +12,8 @@ from hsi_sc_nerf.models.pipeline import SpectralPipeline
 from hsi_sc_nerf.models.run_settings import read_config
 from hsi_sc_nerf.models.stages import full_frame_stage
 
+pytestmark = pytest.mark.usefixtures("quick_start")
+
 SWITCH, STEPS = 8, 20
 EVALUATIONS = {"steps_per_eval_batch": 5, "steps_per_eval_image": 13}
 

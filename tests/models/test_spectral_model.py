@@ -7,6 +7,8 @@ from small_trainer import untrained_pipeline
 
 from hsi_sc_nerf.models.compositing import BasisDecoder, SpectralRenderer
 
+pytestmark = pytest.mark.usefixtures("quick_start")
+
 
 @pytest.fixture
 def samples():

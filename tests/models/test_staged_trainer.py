@@ -18,6 +18,8 @@ from hsi_sc_nerf.models.checkpoints import allow_nerfstudio_checkpoints
 from hsi_sc_nerf.models.stages import StageConfig, full_frame_stage, masked_stage
 from hsi_sc_nerf.packed.pixels import BOUNDARY_PX
 
+pytestmark = pytest.mark.usefixtures("quick_start")
+
 
 @pytest.mark.slow
 def test_two_stages_run_in_one_go(tiny_dataset, tmp_path, device):

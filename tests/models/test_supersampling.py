@@ -9,6 +9,8 @@ from small_trainer import untrained_pipeline
 from hsi_sc_nerf.data.camera_rays import QUARTERS
 from hsi_sc_nerf.models.supersampling import mean_over_pixels, outline_pixels, parts_of_pixels, supersampled_view
 
+pytestmark = pytest.mark.usefixtures("quick_start")
+
 
 def test_a_pixels_mean_and_parts_agree_with_a_loop():
     generator = torch.Generator().manual_seed(0)
