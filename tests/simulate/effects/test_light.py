@@ -103,8 +103,10 @@ def test_white_furnace(still_life):
     renderer = Renderer([part(ball(), "white", True)])
     seen = if_white(*picture(renderer, [ChamberShading(), InterReflection(), Gloss()]))
     np.testing.assert_allclose(seen, 1.0, atol=2e-6)
-    # Neighbours that are evenly lit and as white as the chamber cannot be seen either.
-    np.testing.assert_allclose(if_white(*picture(still_life, [InterReflection(16)])), 1.0, atol=2e-3)
+    # Neighbours that are evenly lit and as white as the chamber cannot be seen either. A coat mirrors what it keeps
+    # from the body, of the chamber or of the other parts.
+    for effects in ([InterReflection(16)], [InterReflection(16), Gloss()]):
+        np.testing.assert_allclose(if_white(*picture(still_life, effects)), 1.0, atol=2e-3)
 
 
 ALL = (ChamberShading(16), InterReflection(16), Lamp(), Gloss(roughness=1.0))
@@ -128,7 +130,7 @@ def test_energy_is_never_created(still_life, effects):
 @pytest.mark.parametrize("roughness", [0.1, 0.25, 1.0])
 def test_a_white_point_under_the_lamp_sends_no_more_than_it_gets(roughness):
     gloss = Gloss(roughness=roughness)
-    cosine, azimuth = np.meshgrid((np.arange(800) + 0.5) / 800, 2 * np.pi * np.arange(800) / 800, indexing="ij")
+    cosine, azimuth = np.meshgrid((np.arange(400) + 0.5) / 400, 2 * np.pi * np.arange(400) / 400, indexing="ij")
     sine = np.sqrt(1.0 - cosine**2)
     views = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine], axis=-1).reshape(-1, 3)
     cosine = views[:, 2]
@@ -171,13 +173,6 @@ def wall_and_floor(height_m=0.1):
     return surface, points[8:14], points[21:], hidden
 
 
-def test_wall_hides_its_form_factor_of_the_sky():
-    surface, on_floor, _, hidden = wall_and_floor()
-    free = surface.surroundings(2048).chamber_visibility[on_floor]
-    np.testing.assert_allclose(free, 1.0 - hidden, atol=5e-3)
-    assert free[0] == pytest.approx(0.5, abs=0.015)
-
-
 @pytest.mark.parametrize("is_shaded", [False, True])
 def test_bounce_has_the_form_factor_and_both_colours(is_shaded):
     surface, on_floor, on_wall, hidden = wall_and_floor()
@@ -200,9 +195,9 @@ def test_bounce_has_the_form_factor_and_both_colours(is_shaded):
 def test_contact_shadow_of_a_drum_on_a_disc_as_by_brute_force():
     radius_m, height_m = 0.045, 0.07
     drum = part(cylinder(2 * radius_m, height_m, 128, spacing_m=0.0025), "drum")
-    disc = part(cylinder(0.2, 0.006, 128, spacing_m=0.0025).moved(np.array([0.0, 0.0, -0.0063])), "disc")
+    disc = part(cylinder(0.175, 0.006, 128, spacing_m=0.0025).moved(np.array([0.0, 0.0, -0.0063])), "disc")
     distance_m = np.array([0.0003, 0.001, 0.0022, 0.005, 0.01, 0.02, 0.04])
-    lighting = Lighting(Renderer([drum, disc]), [ChamberShading(512)])
+    lighting = Lighting(Renderer([drum, disc]), [ChamberShading(256)])
     # The mean over azimuths is free of most of the chance in single points.
     azimuth = np.linspace(0.0, 2 * np.pi, 90, endpoint=False)
     around = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
@@ -298,11 +293,6 @@ def test_gloss_mirrors_the_chamber_and_what_hides_it(still_life):
     assert of_object[1] < 1 - at_normal
     assert of_support[1] == pytest.approx(1.0 - of_object[1], abs=1e-6)
     assert (of_support[2], chamber[2]) == (1.0, 0.0)
-
-
-def test_in_a_white_furnace_glossy_neighbours_cannot_be_seen(still_life):
-    """What the coat keeps from the body it mirrors, of the chamber or of the other parts."""
-    np.testing.assert_allclose(if_white(*picture(still_life, [InterReflection(16), Gloss()])), 1.0, atol=2e-3)
 
 
 # Two effects together are what their definitions say
