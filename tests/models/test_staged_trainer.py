@@ -199,15 +199,15 @@ def test_ctrl_c_is_one_line_and_names_the_last_checkpoint(tiny_dataset, tmp_path
     assert [path.name for path in made.checkpoint_dir.iterdir()] == ["step-000000002.ckpt"]
 
 
+def full_disk(*_, **__):
+    raise OSError(28, "No space left on device")
+
+
 @pytest.mark.slow
 def test_a_full_disk_leaves_the_earlier_checkpoint(tiny_dataset, tmp_path, monkeypatch):
     made = trainer(tiny_dataset, tmp_path)
     made.save_checkpoint(0)
     before = list(made.checkpoint_dir.iterdir())
-
-    def full_disk(*arguments, **options):
-        raise OSError(28, "No space left on device")
-
     monkeypatch.setattr(torch, "save", full_disk)
     with pytest.raises(SystemExit, match="No space left"):
         made.save_checkpoint(1)
@@ -232,10 +232,6 @@ def test_a_disk_that_fills_up_in_training_is_one_sentence(
 @pytest.mark.slow
 def test_logs_that_cannot_be_written_end_a_run_in_one_sentence(tiny_dataset, tmp_path, monkeypatch):
     made = trainer(tiny_dataset, tmp_path, max_num_iterations=2)
-
-    def full_disk():
-        raise OSError(28, "No space left on device")
-
     monkeypatch.setattr(staged_trainer, "flush_logs", full_disk)
     with pytest.raises(SystemExit, match=rf"^hsi-sc-nerf: {made.base_dir}: [^\n]*No space left[^\n]*--load-dir\.$"):
         made.train()

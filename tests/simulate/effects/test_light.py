@@ -53,11 +53,15 @@ def if_white(light, colours):
     return light @ colour_spectra(colours, np.ones((9, 2)))
 
 
-def light_below(lighting, points, camera_to_world=None):
-    """Light of the highest points at some (x, y), as weights by colour."""
+def highest(renderer, points):
+    """The highest points at some (x, y)."""
     origins = np.column_stack([points, np.full(len(points), 0.5)]).astype(np.float32)
-    hits = lighting._renderer.cast(origins, np.broadcast_to(DOWN, origins.shape).astype(np.float32), 1)
-    weights, colours = lighting.light(hits, np.eye(4) if camera_to_world is None else camera_to_world)
+    return renderer.cast(origins, np.broadcast_to(DOWN, origins.shape).astype(np.float32), 1)
+
+
+def light_below(lighting, points):
+    """Light of the highest points at some (x, y), as weights by colour."""
+    weights, colours = lighting.light(highest(lighting._renderer, points), np.eye(4))
     return dict(zip(colours, weights.T, strict=True))
 
 
@@ -84,9 +88,7 @@ def test_reflections_sum_the_series_of_form_factors(still_life, bounces):
     for _ in range(bounces):
         arriving = factors @ arriving
         expected = expected + arriving
-    points = np.array([[0.07, 0.0], [0.0, -0.08], [0.02, 0.02]])
-    origins = np.column_stack([points, np.full(len(points), 0.5)]).astype(np.float32)
-    hits = still_life.cast(origins, np.broadcast_to(DOWN, origins.shape).astype(np.float32), 1)
+    hits = highest(still_life, np.array([[0.07, 0.0], [0.0, -0.08], [0.02, 0.02]]))
     seen = if_white(*lighting.light(hits, camera))[:, 0]
     direct = Lighting(still_life, [ChamberShading(16), Lamp(0.5)])
     seen -= if_white(*direct.light(hits, camera))[:, 0]
