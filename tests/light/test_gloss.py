@@ -72,7 +72,7 @@ def test_noise_or_light_without_lamps_is_no_gloss():
 
 
 def test_a_glossy_ball_gets_the_material_below_its_gloss():
-    ball = turning_ball(900)
+    ball = turning_ball(1500)
     views, _, material = measured(ball, 0.5)
     matte = fit_light(ball, views, FACING)
     assert matte.gloss is None
@@ -89,7 +89,7 @@ def test_a_glossy_ball_gets_the_material_below_its_gloss():
 
 
 def test_the_lamps_keep_their_colour_where_a_glossy_ball_is_dark():
-    ball = turning_ball(900)
+    ball = turning_ball(1500)
     views, _, _ = measured(ball, 0.5)
     light = fit_light(ball, views, FACING).light
     # What is mirrored is brighter by 30 % than the chamber is on average.

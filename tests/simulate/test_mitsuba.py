@@ -30,7 +30,7 @@ def agreement(scene, transport, effects=(), frame=2):
 
 @pytest.mark.slow
 def test_matte_scene_in_even_light_agrees_within_monte_carlo_error():
-    found = agreement(small("pear", size_px=16), "even")
+    found = agreement(small("pear"), "even")
     # The pear's skin, blush and pale dots meet in single triangles: fractions of three materials are right as well.
     assert found.rms < 1.15 * found.expected
     assert found.expected < 0.015
@@ -40,7 +40,7 @@ def test_matte_scene_in_even_light_agrees_within_monte_carlo_error():
 
 @pytest.mark.slow
 def test_shading_and_one_bounce_agree():
-    found = agreement(small("sphere", size_px=16), "one_bounce", ["chamber_shading", "inter_reflection"])
+    found = agreement(small("sphere"), "one_bounce", ["chamber_shading", "inter_reflection"])
     # Light at points a few mm apart is less sharp than Mitsuba's at the foot of things.
     assert found.rms < 1.5 * found.expected
     for bias, error in (found.bias, found.bias_of_material["matte_white"]):

@@ -132,7 +132,7 @@ def test_energy_is_never_created(still_life, effects):
 @pytest.mark.parametrize("roughness", [0.1, 0.25, 1.0])
 def test_a_white_point_under_the_lamp_sends_no_more_than_it_gets(roughness):
     gloss = Gloss(roughness=roughness)
-    cosine, azimuth = np.meshgrid((np.arange(400) + 0.5) / 400, 2 * np.pi * np.arange(400) / 400, indexing="ij")
+    cosine, azimuth = np.meshgrid((np.arange(800) + 0.5) / 800, 2 * np.pi * np.arange(800) / 800, indexing="ij")
     sine = np.sqrt(1.0 - cosine**2)
     views = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine], axis=-1).reshape(-1, 3)
     cosine = views[:, 2]
