@@ -251,6 +251,7 @@ ANGLES_DEG = (0.0, 90.0, 180.0, 270.0)
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("blank_figures")
 def test_the_packed_frames_pictures_are_read_and_reported(tmp_path):
     folder = write_session(tmp_path / "session", ANGLES_DEG)
     session = open_session(folder)
@@ -276,6 +277,7 @@ def test_the_packed_frames_pictures_are_read_and_reported(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("blank_figures")
 def test_pictures_are_not_read_where_nothing_is_measured(tmp_path):
     session = open_session(write_session(tmp_path / "session", ANGLES_DEG))
     blank = [np.zeros((48, 48), np.uint8)] * 4

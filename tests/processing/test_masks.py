@@ -150,6 +150,7 @@ def test_mask_picture_draws_each_outline(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("blank_figures")
 def test_the_shaded_underside_is_the_objects(tmp_path):
     """A simulated session in the chamber's uneven light, where the fruit's underside lies in its own shade."""
     effects = ("photon_noise", "read_noise", "chamber_shading")
