@@ -19,7 +19,7 @@ from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.scene import load_scene, override
 from hsi_sc_nerf.spectra import bands_within, to_8_bit
 
-SIZE_PX, FRAMES = 288, 24
+SIZE_PX, FRAMES = 224, 20
 
 
 @pytest.fixture(scope="module")
