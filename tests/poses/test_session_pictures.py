@@ -188,7 +188,7 @@ def test_the_best_picture_is_sharp_quiet_and_well_exposed(pear, tmp_path, kinds,
 
 @pytest.fixture(scope="module")
 def machine():
-    scene = MarkerScene(size_px=128, frames=10, noise=0.003)
+    scene = MarkerScene(size_px=128, frames=6, noise=0.003)
     return scene, scene.render()
 
 
