@@ -61,7 +61,9 @@ def found(**changes):
     return {finding.name: finding for finding in check_appearance(ball(**changes), NAMES)}
 
 
-@pytest.mark.parametrize(("noise", "contrast"), [(0.0, 0.0), (0.0, 0.4), (0.06, 0.0), (0.06, 0.1), (0.06, 0.4)])
+@pytest.mark.parametrize(
+    ("noise", "contrast"), [(0.0, 0.0), (0.0, 0.4), (0.02, 0.1), (0.06, 0.0), (0.06, 0.1), (0.06, 0.4)]
+)
 def test_a_good_session_has_no_findings(noise, contrast):
     assert found(noise=noise, contrast=contrast) == {}
 
