@@ -89,7 +89,7 @@ def test_session_without_drift_stays_as_it_is(effects):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("effects", "name"), [((), "pear"), ((*NOISE, DRIFT), "maize")])
+@pytest.mark.parametrize(("effects", "name"), [((), "pear"), ((*NOISE, DRIFT), "maize"), ((*NOISE, "lamp"), "apple")])
 def test_not_measurable_where_the_object_fills_the_frame(effects, name):
     drift, _, _ = simulated(*effects, name=name, bands=20, frames=5, field_of_view_deg=4.0, aim_height_m=0.11)
     assert isinstance(drift, NotMeasurable)
