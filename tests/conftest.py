@@ -97,6 +97,15 @@ def limit_of_files(monkeypatch):
     return limited
 
 
+@pytest.fixture
+def blank_figures(monkeypatch):
+    """Figures are written as one black pixel: drawing them takes most of the time of `process` on a small session."""
+    from matplotlib.figure import Figure
+    from PIL import Image
+
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path: Image.new("RGB", (1, 1)).save(path, "png"))
+
+
 @pytest.fixture(scope="session", params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 def device(request):
     """Devices that tensors are tested on; ``pytest -m gpu`` runs what needs a GPU alone."""
