@@ -1,12 +1,13 @@
 """Six small simulated sessions for `hsi-sc-nerf batch`, of which one is broken and one has no markers.
 
-``tests/cli/test_batch_sessions.py`` runs them on this machine, ``batch_slurm.py`` on a SLURM.
+``batch_slurm.py`` runs them on a SLURM, ``tests/cli/test_batch_sessions.py`` three of them on this machine.
 """
 
 from __future__ import annotations
 
 import csv
 import shutil
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,17 +33,22 @@ TRAIN += " --pipeline.model.proposal-warmup 100 --evaluate-stages False"
 TRAITS = "--mesh.octree-depth 5"
 
 
-def write_six_sessions(folder: Path) -> Path:
-    """Simulate the sessions in ``folder/captures``; the path of the list that names them, ``folder/season.csv``."""
+def write_six_sessions(folder: Path, names: Collection[str] = tuple(OBJECTS)) -> Path:
+    """Simulate the sessions of these names in ``folder/captures``; the broken one is a copy of ``pear_1``.
+
+    Returns:
+        The list that names them, ``folder/season.csv``.
+    """
+    objects = {name: known for name, known in OBJECTS.items() if name in names}
     for seed, (name, (kind, *_)) in enumerate(OBJECTS.items(), start=1):
-        if name != BROKEN:
+        if name in objects and name != BROKEN:
             _simulate(folder / "captures" / name, kind, seed, marked=name != UNMARKED)
     shutil.copytree(folder / "captures" / "pear_1", folder / "captures" / BROKEN)
     cut = folder / "captures" / BROKEN / WHITE_REFERENCE / "capture" / f"{WHITE_REFERENCE}.raw"
     cut.write_bytes(cut.read_bytes()[:-1000])
     path = folder / "season.csv"
     with path.open("w", newline="") as file:
-        rows = [(name, f"captures/{name}", genotype, train) for name, (_, genotype, train) in OBJECTS.items()]
+        rows = [(name, f"captures/{name}", genotype, train) for name, (_, genotype, train) in objects.items()]
         csv.writer(file).writerows([("object", "session", "genotype", "train"), *rows])
     return path
 

@@ -97,6 +97,15 @@ def limit_of_files(monkeypatch):
     return limited
 
 
+@pytest.fixture
+def blank_figures(monkeypatch):
+    """Figures are written as one black pixel: drawing them takes most of the time of `process` on a small session."""
+    from matplotlib.figure import Figure
+    from PIL import Image
+
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path: Image.new("RGB", (1, 1)).save(path, "png"))
+
+
 @pytest.fixture(scope="session", params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 def device(request):
     """Devices that tensors are tested on; ``pytest -m gpu`` runs what needs a GPU alone."""
@@ -105,6 +114,21 @@ def device(request):
     if request.param == "cuda" and not torch.cuda.is_available():
         pytest.skip("no GPU: CUDA is not available here")
     return request.param
+
+
+@pytest.fixture(scope="module")
+def quick_start():
+    """Training begins in tenths of a second: with a coarse grid, and a field that is taught to be solid in few steps.
+
+    For tests of what comes after; models/test_occupancy_sampler.py tests how a field begins.
+    """
+    from hsi_sc_nerf.fields import occupancy_grid
+    from hsi_sc_nerf.fields.spectral_field import SpectralField
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(occupancy_grid, "GRID_CELLS", 32)
+        patch.setattr(SpectralField.start_solid, "__defaults__", (8,))
+        yield
 
 
 @pytest.fixture(scope="module")

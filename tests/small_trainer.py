@@ -44,6 +44,7 @@ def trainer(
 def untrained_pipeline(data: Path):
     """The pipeline of a dataset, in test mode."""
     config = copy.deepcopy(hsi_sc_nerf.config.pipeline)
+    shrink(config.model)
     config.datamanager.data = config.datamanager.dataparser.data = data
     torch.manual_seed(0)
     return config.setup(device="cpu", test_mode="test")

@@ -70,24 +70,6 @@ def test_work_is_unwound_and_the_line_is_the_last(capsys):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_what_a_library_makes_of_it_is_the_same_line(capsys):
-    def library():
-        try:
-            press()
-            wait()
-        except KeyboardInterrupt:
-            raise ImportError("a library failed") from None
-
-    with pytest.raises(SystemExit), interruption.one_line(lambda: "stopped"):
-        library()
-    assert capsys.readouterr().err == "stopped\n"
-
-
-def test_other_errors_pass():
-    with pytest.raises(ImportError), interruption.one_line():
-        raise ImportError
-
-
 def test_where_it_cannot_be_raised_it_comes_again_and_nothing_is_printed_there(capsys):
     class Destroyed:
         def __del__(self):

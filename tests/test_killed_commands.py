@@ -20,13 +20,13 @@ from hsi_sc_nerf.files import atomic_write, write_json
 
 
 @pytest.mark.slow
-def test_process_killed_again_and_again_goes_on_to_the_same_dataset(tiny_dataset, tmp_path):
+def test_process_killed_again_and_again_goes_on_to_the_same_dataset(tiny_dataset, tmp_path, monkeypatch, command):
     data, session = tiny_dataset
-    command = KilledCommand("process", ("hsi-sc-nerf", "process", str(session), "--output-dir", "out"))
+    killed = KilledCommand("process", ("hsi-sc-nerf", "process", str(session), "--output-dir", "out"))
     out = tmp_path / "out"
     # Calibration and frames; poses; masks, effects and the end.
     for sign in (".cache/*.note", "poses.json", "masks/*.png"):
-        process = start(command.words, tmp_path)
+        process = start(killed.words, tmp_path)
         while process.poll() is None and not list(out.glob(sign)):
             time.sleep(0.01)
         assert process.poll() is None, (tmp_path / "log").read_text()
@@ -34,7 +34,8 @@ def test_process_killed_again_and_again_goes_on_to_the_same_dataset(tiny_dataset
         process.wait()
         assert half_written(out, data) == []
         assert not (out / "transforms.json").exists()
-    assert start(command.again(tmp_path), tmp_path).wait() == 0
+    monkeypatch.chdir(tmp_path)
+    assert command(*killed.again(tmp_path)[1:]) == 0
     assert differences(data, out) == []
     assert leftovers(out, data) == []
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from nerfstudio.cameras.rays import Frustums, RaySamples
+from ray_samples import samples_along
 
 from hsi_sc_nerf.evaluation import spectral_metrics as metrics
 from hsi_sc_nerf.models.compositing import BasisDecoder, SpectralRenderer
@@ -115,12 +115,6 @@ def test_constant_thin_and_one_band_pictures_have_scores(device, dtype, shape, l
         assert other["rmse"] == pytest.approx(0.25)
         assert other["psnr"] == pytest.approx(-20 * math.log10(0.25), rel=1e-5)
         assert np.isfinite(list(other.values())).all()
-
-
-def samples_along(starts, ends):
-    rays = torch.zeros(*starts.shape, 3, device=starts.device)
-    frustums = Frustums(rays, rays, starts[..., None], ends[..., None], torch.ones_like(starts)[..., None])
-    return RaySamples(frustums, deltas=(ends - starts)[..., None])
 
 
 densities = st.lists(st.sampled_from([0.0, 1e-40, 1e-10, 1.0, 1e3, 1e10, 3e38]), min_size=6, max_size=6)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from nerfstudio.cameras.rays import Frustums, RaySamples
+from ray_samples import samples_along
 from scipy.linalg import expm
 from torch.func import functional_call
 from torch.nn import functional
@@ -59,10 +59,7 @@ def segments():
 
 
 def light_through(density):
-    starts, ends = segments()
-    at = torch.zeros(3, 5, 3, dtype=torch.float64)
-    frustums = Frustums(at, at, starts[..., None], ends[..., None], torch.ones_like(starts)[..., None])
-    return RaySamples(frustums, deltas=(ends - starts)[..., None]).get_weights(density)
+    return samples_along(*segments()).get_weights(density)
 
 
 def spectrum(behind):
@@ -207,9 +204,8 @@ def test_distortion_is_the_mean_distance_of_points_drawn_by_the_weights():
 )
 def test_weights_are_those_of_fifty_digits(density, length):
     ends = torch.tensor([length]).cumsum(-1)
-    at = torch.zeros(1, 5, 3)
-    frustums = Frustums(at, at, ends[..., None], ends[..., None], torch.ones(1, 5, 1))
-    samples = RaySamples(frustums, deltas=torch.tensor([length])[..., None])
+    samples = samples_along(ends - torch.tensor([length]), ends)
+    samples.deltas = torch.tensor([length])[..., None]  # not rounded
     found = samples.get_weights(torch.tensor([density])[..., None]).flatten().tolist()
     with mpmath.workdps(50):
         through = mpmath.mpf(1)

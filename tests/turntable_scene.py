@@ -133,12 +133,20 @@ class MarkerScene:
         extent = texture.shape[0]
         outline = np.array([[[0, 0], [extent, 0], [extent, extent], [0, extent]]], np.float64) - 0.5
         quad = cv2.perspectiveTransform(outline, homography)
-        mask = np.zeros(canvas.shape, np.uint8)
-        cv2.fillConvexPoly(mask, np.round(quad * 16).astype(np.int32), 1, shift=4)
+        # Only the part of the canvas around the marker is drawn.
+        corner = np.clip(np.floor(quad[0].min(axis=0)).astype(int) - 1, 0, canvas.shape[0])
+        left, top = corner
+        right, bottom = np.clip(np.ceil(quad[0].max(axis=0)).astype(int) + 2, corner, canvas.shape[0])
+        to_corner[:2, 2] = -corner
+        part = canvas[top:bottom, left:right]
+        if not part.size:
+            return
+        mask = np.zeros(part.shape, np.uint8)
+        cv2.fillConvexPoly(mask, np.round((quad - corner) * 16).astype(np.int32), 1, shift=4)
         warped = cv2.warpPerspective(
-            texture, homography, canvas.shape[::-1], flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            texture, to_corner @ homography, part.shape[::-1], flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
-        canvas[mask > 0] = warped[mask > 0]
+        part[mask > 0] = warped[mask > 0]
 
 
 def _square(right, up, half):

@@ -54,7 +54,7 @@ def test_growth_by_a_ring_is_the_rings_area_in_any_direction_of_change(plane, di
     assert region.area_m2 == pytest.approx(np.pi * (0.013**2 - 0.009**2), rel=0.06)
 
 
-@pytest.mark.parametrize("direction", [[1.0], [-1.0], [0.6, 0.8, 0.0]])
+@pytest.mark.parametrize("direction", [[-1.0], [0.6, 0.8, 0.0]])
 def test_a_ring_that_is_as_narrow_as_its_edges_has_the_area_between_both_days_edges(plane, direction):
     """Its change has no plateau; what it is to reach is seen inside, where nothing changed."""
     before, after = (disc(plane, 0.03, radius_m)[:, None] * direction for radius_m in (0.009, 0.0116))

@@ -10,7 +10,6 @@ from true_object import TrueObject
 from hsi_sc_nerf.analysis.change_features import surface_gradients, surface_samples
 from hsi_sc_nerf.analysis.change_registration import find_attitude
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.geometry.camera import Similarity
 from hsi_sc_nerf.simulate.materials import endmembers
 from hsi_sc_nerf.simulate.mesh import sphere
 
@@ -20,7 +19,8 @@ POINTS = 20_000
 
 def registered(before, after):
     samples = surface_samples([before, after], [before.spectra, after.spectra], ("before", "after"))
-    return find_attitude(samples[1], samples[0])
+    # Of the starts every fourth, none of which is where the fruit was turned to.
+    return find_attitude(samples[1], samples[0], lambda starts: starts[::4])
 
 
 @pytest.fixture(scope="module")
@@ -87,12 +87,3 @@ def test_gradients_of_a_linear_function_on_a_tilted_plane_are_its_slopes_along_t
     slopes = random.normal(size=(2, 3))
     found = surface_gradients(points, points @ slopes.T)
     np.testing.assert_allclose(found, np.broadcast_to(slopes @ along.T @ along, found.shape), atol=1e-9)
-
-
-def test_the_way_back_of_a_set_down_fruit_is_its_inverse():
-    vertices = np.random.default_rng(0).normal(size=(20, 3))
-    placed = set_down(SetDown(turn_deg=40.0, tip_deg=5.0, growth=1.1), vertices)
-    there_and_back = placed.inverse().after(placed)
-    assert isinstance(there_and_back, Similarity)
-    np.testing.assert_allclose(there_and_back.matrix(), np.eye(4), atol=1e-12)
-    assert placed(vertices)[:, 2].min() == pytest.approx(0.07)

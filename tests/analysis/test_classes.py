@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from halved_cylinder import BROWN, GREEN, NM
 
 from hsi_sc_nerf.analysis.classes import unmix
 from hsi_sc_nerf.analysis.library import SpectralLibrary
@@ -9,8 +10,7 @@ from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.analysis.traits import classified
 from hsi_sc_nerf.simulate.mesh import cylinder
 
-NM = np.linspace(400.0, 1000.0, 31)
-GREEN, BROWN, RED = np.linspace(0.1, 0.6, 31), np.linspace(0.4, 0.3, 31), 0.5 + 0.3 * np.sin(NM / 60.0)
+RED = 0.5 + 0.3 * np.sin(NM / 60.0)
 ENDMEMBERS = np.stack([GREEN, BROWN, RED])
 
 

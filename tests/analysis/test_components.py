@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from hsi_sc_nerf.analysis.components import find_components, purest_spectra
-from hsi_sc_nerf.analysis.library import read_library, write_library
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.numerics import spectral_angle
 from hsi_sc_nerf.simulate.mesh import cylinder
@@ -89,11 +88,3 @@ def test_scores_are_those_of_a_singular_value_decomposition():
     scores = found.scores[surface.seen]
     np.testing.assert_allclose(np.abs(scores), np.abs(expected), atol=1e-8)
     np.testing.assert_allclose(found.variance_fractions, (singular**2 / (singular**2).sum())[:2])
-
-
-def test_endmembers_are_a_library(tmp_path):
-    library = find_components(surface_of(0.001, True)[0], 3).endmembers
-    write_library(tmp_path / "endmembers.csv", library)
-    read = read_library(tmp_path / "endmembers.csv")
-    assert read.names == library.names
-    np.testing.assert_allclose(read.spectra, library.spectra, rtol=1e-5)

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from halved_cylinder import BROWN, two_halves
 from random_cloud import random_cloud
 
 from hsi_sc_nerf.analysis.drawn_regions import (
@@ -13,20 +14,8 @@ from hsi_sc_nerf.analysis.drawn_regions import (
     read_drawn_regions,
     write_drawn_regions,
 )
-from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 from hsi_sc_nerf.analysis.traits import WHOLE, RegionOfInterest, analyse
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.simulate.mesh import cylinder
-
-NM = np.linspace(400.0, 1000.0, 31)
-GREEN, BROWN = np.linspace(0.1, 0.6, 31), np.linspace(0.4, 0.3, 31)
-
-
-def two_halves():
-    """A cylinder, 4 cm wide and high: green at y > 0, brown below."""
-    mesh = cylinder(0.04, 0.04, segments=128, spacing_m=0.001)
-    spectra = np.where(mesh.vertices[:, 1:2] > 0.0, GREEN, BROWN).astype(np.float32)
-    return SpectralMesh(mesh, spectra, NM, np.ones(len(spectra), bool))
 
 
 def written(path, points_m, **chosen):
@@ -40,7 +29,7 @@ def random_points(surface, count, shift_m=0.0):
     return rng.choice(surface.mesh.vertices, count, replace=False) + shift_m + rng.normal(0.0, 2e-5, (count, 3))
 
 
-def test_area_and_spectrum_of_a_drawn_half(tmp_path):
+def test_area_and_spectrum_of_a_drawn_half_which_is_written_as_it_was_read(tmp_path):
     """The edge lies between points, so that an area is neither widened nor narrowed by their spacing."""
     surface = two_halves()
     points_m = random_points(surface, 2000)
@@ -51,6 +40,11 @@ def test_area_and_spectrum_of_a_drawn_half(tmp_path):
     assert list(found) == [WHOLE, "brown", "top", "ball"]
     assert found["brown"].area_m2 == pytest.approx(surface.mesh.area_m2() / 2.0, rel=0.01)
     np.testing.assert_allclose(found["brown"].spectrum.mean, BROWN, rtol=0.03)
+    write_drawn_regions(tmp_path / "again.json", [brown, top])
+    for one, again in zip([brown, top], read_drawn_regions(tmp_path / "again.json"), strict=True):
+        assert one.name == again.name
+        np.testing.assert_array_equal(one.chosen, again.chosen)
+        np.testing.assert_allclose(one.points_m, again.points_m, atol=1e-6)
 
 
 def test_regions_of_another_object_and_unseen_ones_are_refused(tmp_path):
@@ -106,14 +100,3 @@ def test_the_page_has_whole_points_with_what_belongs_to_them():
     for needs_points in (points_of_page, propose_regions):
         with pytest.raises(InputError, match="no point with a spectrum"):
             needs_points(cloud)
-
-
-def test_written_regions_are_those_that_are_read(tmp_path):
-    surface = two_halves()
-    points_m = random_points(surface, 400)
-    file = written(tmp_path / "regions.json", points_m, brown=points_m[:, 1] < 0.0, top=points_m[:, 2] > 0.03)
-    write_drawn_regions(tmp_path / "again.json", read_drawn_regions(file))
-    for one, again in zip(read_drawn_regions(file), read_drawn_regions(tmp_path / "again.json"), strict=True):
-        assert one.name == again.name
-        np.testing.assert_array_equal(one.chosen, again.chosen)
-        np.testing.assert_allclose(one.points_m, again.points_m, atol=1e-6)

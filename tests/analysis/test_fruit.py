@@ -123,7 +123,7 @@ def test_command_writes_all_results(tmp_path, capsys):
     TraitsCommand(
         tmp_path / "cloud.ply",
         output,
-        mesh=MeshConfig(octree_depth=6, base_height_m=STAND_M),
+        mesh=MeshConfig(octree_depth=5, base_height_m=STAND_M),
         splits=1,
         library=tmp_path / "library.csv",
         roi=(("spot", 0.0, 0.02, STAND_M + 0.025, 0.006),),

@@ -17,7 +17,7 @@ from hsi_sc_nerf.export.cloud import SpectralCloud
 from hsi_sc_nerf.files import read_json
 from hsi_sc_nerf.report.run_sections import traits_section
 
-CONFIG = MeshConfig(octree_depth=6, base_height_m=STAND_M)
+CONFIG = MeshConfig(octree_depth=5, base_height_m=STAND_M)
 
 
 def balls(*scales_and_places) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -3,9 +3,7 @@
 import pytest
 
 from hsi_sc_nerf.analysis.report import trait_tables
-from hsi_sc_nerf.analysis.traits import (
-    WHOLE,
-)
+from hsi_sc_nerf.analysis.traits import WHOLE
 
 SIZES = ("area_m2", "volume_l", "height_m", "largest_diameter_m", "smallest_diameter_m", "equivalent_diameter_m")
 BALL = {
@@ -17,6 +15,7 @@ BALL = {
     "classes": None,
 }
 """Content of ``traits.json`` without its regions."""
+REGION = {"area_m2": 0.01, "indices": {}, "reflectance": {"mean": 0.4, "std": None}}
 
 
 @pytest.mark.parametrize(
@@ -31,16 +30,10 @@ BALL = {
     ],
 )
 def test_sizes_have_the_decimals_of_their_uncertainty(height_m, sd_m, shown):
-    content = {
-        "size": dict.fromkeys(SIZES, height_m),
-        "size_sd": None if sd_m is None else dict.fromkeys(SIZES, sd_m),
-        "size_sd_by_cause": {} if sd_m is None else {"base": dict.fromkeys(SIZES, sd_m)},
-        "seen_area_m2": 0.01,
-        "watertight": True,
-        "classes": None,
-        "regions": {WHOLE: {"area_m2": 0.01, "indices": {}, "reflectance": {"mean": 0.4, "std": None}}},
-    }
-    sizes, _ = trait_tables(content)
+    sizes_m = {"size": dict.fromkeys(SIZES, height_m)}
+    if sd_m is not None:
+        sizes_m |= {"size_sd": dict.fromkeys(SIZES, sd_m), "size_sd_by_cause": {"base": dict.fromkeys(SIZES, sd_m)}}
+    sizes, _ = trait_tables({**BALL, **sizes_m, "regions": {WHOLE: REGION}})
     assert ["height", shown, "mm"] in sizes.rows
     assert ("the unseen base" in sizes.note) == (sd_m is not None)
     assert ("the scale" in sizes.note) == (sd_m is not None)
@@ -48,8 +41,7 @@ def test_sizes_have_the_decimals_of_their_uncertainty(height_m, sd_m, shown):
 
 @pytest.mark.parametrize("settings", [{}, {"metric": False}])
 def test_sizes_of_a_session_without_a_scale_are_said_to_be_wrong(settings):
-    whole = {"area_m2": 0.01, "indices": {}, "reflectance": {"mean": 0.4, "std": None}}
-    sizes, _ = trait_tables({**BALL, "settings": settings, "regions": {WHOLE: whole}})
+    sizes, _ = trait_tables({**BALL, "settings": settings, "regions": {WHOLE: REGION}})
     assert ("wrong" in sizes.note) == bool(settings)
 
 

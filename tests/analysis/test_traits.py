@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from halved_cylinder import BROWN, GREEN, NM, two_halves
 from known_fruit import NM as FRUIT_NM
 from known_fruit import SKIN, fruit_cloud
 from true_object import TrueObject, relative_rms
@@ -43,16 +44,7 @@ from hsi_sc_nerf.export.cloud import (
 from hsi_sc_nerf.indices.catalogue import find_indices
 from hsi_sc_nerf.simulate.mesh import cylinder, quads
 
-NM = np.linspace(400.0, 1000.0, 31)
-GREEN, BROWN = np.linspace(0.1, 0.6, 31), np.linspace(0.4, 0.3, 31)
 LIBRARY = SpectralLibrary(("green", "brown"), NM, np.stack([GREEN, BROWN]))
-
-
-def two_halves(seen=True):
-    """A cylinder, 4 cm wide and high: green at y > 0, brown below."""
-    mesh = cylinder(0.04, 0.04, segments=128, spacing_m=0.001)
-    spectra = np.where(mesh.vertices[:, 1:2] > 0.0, GREEN, BROWN).astype(np.float32)
-    return SpectralMesh(mesh, spectra, NM, np.full(len(spectra), seen))
 
 
 def test_angles_and_classes_do_not_depend_on_brightness():

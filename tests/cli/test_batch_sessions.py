@@ -1,4 +1,4 @@
-"""`hsi-sc-nerf batch` on six small sessions, one of them broken and one without markers, through the real commands.
+"""`hsi-sc-nerf batch` on three small sessions, a whole, a broken and an unmarked one, through the real commands.
 
 The first call's steps are forked from one process (tests/forked_steps.py), and those after it started as the shipped
 workflow starts them.
@@ -13,7 +13,7 @@ from io import StringIO
 
 import pytest
 from forked_steps import forked_workflow
-from six_sessions import BROKEN, OBJECTS, TRAIN, TRAITS, UNMARKED, WHOLE, write_six_sessions
+from six_sessions import BROKEN, OBJECTS, TRAIN, TRAITS, UNMARKED, write_six_sessions
 
 from hsi_sc_nerf.batch.plan import STEPS
 from hsi_sc_nerf.cli import batch
@@ -22,6 +22,8 @@ from hsi_sc_nerf.simulate.session import WHITE_REFERENCE
 
 pytestmark = pytest.mark.slow
 
+WHOLE = "pear_1"
+NAMES = (WHOLE, BROKEN, UNMARKED)
 SKIPPED = ["skipped"] * 6
 
 
@@ -55,7 +57,7 @@ def season(tmp_path_factory):
     """The folder after the first call, and what that printed."""
     pytest.importorskip("snakemake")
     folder = tmp_path_factory.mktemp("season")
-    write_six_sessions(folder)
+    write_six_sessions(folder, NAMES)
     with forked_workflow(folder) as snakefile, pytest.MonkeyPatch.context() as patch:
         patch.setattr(batch, "SNAKEFILE", snakefile)
         printed = call(folder)
@@ -66,16 +68,16 @@ def test_whole_sessions_have_results_and_the_others_a_sentence(season):
     folder, printed = season
     statuses = {name: [status for status, _ in steps] for name, steps in states(folder).items()}
     assert statuses == {
-        **dict.fromkeys(WHOLE, ["done"] * 8),
+        WHOLE: ["done"] * 8,
         BROKEN: ["failed", "failed", *SKIPPED],
         UNMARKED: ["done", "failed", *SKIPPED],
     }
-    assert "4 of 6 objects are done." in printed
+    assert "1 of 3 objects are done." in printed
     rows = table(folder)
-    assert list(rows) == list(OBJECTS)
+    assert list(rows) == list(NAMES)
     for name, row in rows.items():
         assert row["genotype"] == OBJECTS[name][1]
-        whole = name in WHOLE
+        whole = name == WHOLE
         assert (row["status"], row["step"]) == (("done", "") if whole else ("failed", "process"))
         for trait in ("area_cm2", "reflectance", "sam_rad", "train_s"):
             assert bool(row[trait]) == whole, (name, trait)
@@ -93,11 +95,11 @@ def test_a_second_call_does_nothing_and_a_deleted_result_alone_is_made_again(sea
     """By the steps of the shipped workflow."""
     folder, _ = season
     before, listed = states(folder), (folder / "out" / "traits.csv").stat().st_mtime_ns
-    assert "4 of 6 objects are done." in call(folder)
+    assert "1 of 3 objects are done." in call(folder)
     assert states(folder) == before
     assert (folder / "out" / "traits.csv").stat().st_mtime_ns == listed
 
-    (folder / "out" / "objects" / "tomato" / "traits" / "traits.json").unlink()
+    (folder / "out" / "objects" / WHOLE / "traits" / "traits.json").unlink()
     call(folder)
     after = states(folder)
     again = {
@@ -106,7 +108,7 @@ def test_a_second_call_does_nothing_and_a_deleted_result_alone_is_made_again(sea
         for step, old, new in zip(STEPS, before[name], after[name], strict=True)
         if old != new
     }
-    assert again == {("tomato", "traits"), ("tomato", "report")}
-    assert [status for status, _ in after["tomato"]] == ["done"] * 8
+    assert again == {(WHOLE, "traits"), (WHOLE, "report")}
+    assert [status for status, _ in after[WHOLE]] == ["done"] * 8
     assert (folder / "out" / "traits.csv").stat().st_mtime_ns > listed
-    assert table(folder)["tomato"]["area_cm2"]
+    assert table(folder)[WHOLE]["area_cm2"]

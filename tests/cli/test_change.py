@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from another_day import CloudErrors, SetDown, bruise_cm2, cloud_of, fruit_of
 
+from hsi_sc_nerf.analysis import change_pictures
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig
+from hsi_sc_nerf.analysis.pictures import SideViews
 from hsi_sc_nerf.cli import change
 from hsi_sc_nerf.cli.change import ChangeCommand
 from hsi_sc_nerf.errors import InputError
@@ -49,7 +51,9 @@ def written(clouds, tmp_path_factory):
     days = tuple(clouds / name for name in DAYS)
     mesh = MeshConfig(octree_depth=6)
     library = clouds / "library.csv"
-    ChangeCommand(days, out, mesh, band_nm=(670.0,), library=library, repeat=clouds / "repeat").main()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(SideViews.__init__, "__defaults__", (80,))  # pixels of the pictures' height
+        ChangeCommand(days, out, mesh, band_nm=(670.0,), library=library, repeat=clouds / "repeat").main()
     return out
 
 
@@ -127,6 +131,8 @@ def test_a_trained_run_without_a_cloud_is_sampled_and_left_as_it_is(tmp_path, mo
 
     monkeypatch.setattr(trained_run, "open_trained_run", open_ball)
     monkeypatch.setattr(change, "POINTS", 3000)
+    for drawn in ("draw_change", "write_film"):  # `written` has them
+        monkeypatch.setattr(change_pictures, drawn, lambda *_: None)
     before = sorted(config.parent.rglob("*"))
     cloud = change._read(change._file_of(config.parent))
     radius_m = np.linalg.norm(cloud.points - factory.SPHERE_CENTRE_M, axis=1)

@@ -18,6 +18,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import INCIDENCE, write_spectral_ply
 
 QUICK = {"splits": 0, "mesh": MeshConfig(octree_depth=6)}
+COARSE = {"splits": 0, "mesh": MeshConfig(octree_depth=5)}
 
 
 @pytest.mark.slow
@@ -39,7 +40,7 @@ def test_proposed_organs_are_written_and_measured(tmp_path, capfd):
 def test_where_nothing_differs_one_sentence_says_so(tmp_path, capfd):
     cloud = fruit_cloud(stem=SKIN, cap=SKIN, count=8000)
     write_spectral_ply(tmp_path / "ball.ply", cloud.select(np.arange(8000)))
-    TraitsCommand(tmp_path / "ball.ply", tmp_path, propose_regions=True, **QUICK).main()
+    TraitsCommand(tmp_path / "ball.ply", tmp_path, propose_regions=True, **COARSE).main()
     told = capfd.readouterr().err
     assert "body alone" in told
     assert f"no {INCIDENCE}" in told
@@ -84,13 +85,13 @@ def test_results_do_not_replace_what_the_command_is_given(tmp_path, given, optio
 @pytest.mark.slow
 def test_an_onnx_classifier_gives_a_map_and_the_area_of_each_class_in_each_region(tmp_path):
     pytest.importorskip("onnxruntime")
-    write_spectral_ply(tmp_path / "fruit.ply", fruit_cloud())
+    write_spectral_ply(tmp_path / "fruit.ply", fruit_cloud(count=8000))
     shutil.copy(Path(__file__).parents[1] / "analysis" / "calibrations_onnx" / "classes.onnx", tmp_path)
     rows = "".join(f"{nm}\n" for nm in (450, 500, 550, 600, 650, 700))
     (tmp_path / "tissue.csv").write_text(f"# model: classes.onnx\n# classes: dark, bright\nwavelength_nm\n{rows}")
     top = ("top", 0.0, 0.0, 0.03, 0.01)
     TraitsCommand(
-        tmp_path / "fruit.ply", tmp_path, calibration=(tmp_path / "tissue.csv",), roi=(top,), **QUICK
+        tmp_path / "fruit.ply", tmp_path, calibration=(tmp_path / "tissue.csv",), roi=(top,), **COARSE
     ).main()
     content = json.loads((tmp_path / "traits.json").read_text())
     for name in ("whole surface", "top"):

@@ -1,7 +1,6 @@
 """Whatever goes wrong that a user can mend is one line."""
 
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -97,7 +96,7 @@ def test_ctrl_c_while_the_libraries_are_loaded_is_one_line(library):
 
 
 @pytest.mark.slow
-def test_ctrl_c_in_process_is_one_line_and_leaves_nothing_half_written(tiny_dataset, tmp_path):
+def test_ctrl_c_in_process_is_one_line_and_leaves_nothing_half_written(tiny_dataset, tmp_path, command):
     out = tmp_path / "data"
     words = ["process", str(tiny_dataset[1]), "--output-dir", str(out)]
     started = start(words)
@@ -113,29 +112,23 @@ def test_ctrl_c_in_process_is_one_line_and_leaves_nothing_half_written(tiny_data
     assert "Traceback" not in told
     assert not list(out.rglob(".partial-*"))
     assert not Path(out / "transforms.json").exists()
-    subprocess.run([*MAIN, *words], check=True, capture_output=True)
+    assert command(*words) == 0
     for name in ("transforms.json", "cubes/pear_000.bip", "masks/pear_000.png"):
         assert (out / name).read_bytes() == (tiny_dataset[0] / name).read_bytes()
 
 
 @pytest.mark.slow
-def test_a_disk_that_fills_up_in_process_is_one_line_and_leaves_nothing_half_written(tiny_dataset, tmp_path):
+def test_a_disk_that_fills_up_in_process_is_one_line_and_leaves_nothing_half_written(
+    tiny_dataset, tmp_path, command, limit_of_files, capfd
+):
     """A limit to the size of files stands for the disk: a frame's cube has 300 kB."""
     out = tmp_path / "data"
-    words = [*MAIN, "process", str(tiny_dataset[1]), "--output-dir", str(out)]
-    limit = (250_000, resource.RLIM_INFINITY)
-    ended = subprocess.run(
-        words,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"TERM": "dumb"},
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, limit),
-    )
-    assert ended.returncode == 2
-    told = [line for line in ended.stderr.splitlines() if line.startswith("Error: ")]
-    assert len(told) == 1
-    assert "cannot be written" in told[0]
-    assert "Traceback" not in ended.stderr
+    with limit_of_files(250_000):
+        assert command("process", tiny_dataset[1], "--output-dir", out) == 2
+    told = capfd.readouterr().err
+    (error,) = [line for line in told.splitlines() if line.startswith("Error: ")]
+    assert "cannot be written" in error
+    assert "Traceback" not in told
     assert not list(out.rglob("*.bip"))
     assert not list(out.rglob(".partial-*"))
     assert not (out / "transforms.json").exists()

@@ -24,7 +24,7 @@ from hsi_sc_nerf.nerfstudio_commands import extend_nerfstudio_commands
 
 pytestmark = pytest.mark.slow
 
-TEXTURE = ("--target-num-faces", "300", "--num-pixels-per-side", "64")
+TEXTURE = ("--target-num-faces", "100", "--num-pixels-per-side", "32")
 CAMERA = {"camera_to_world": [1, 0, 0, 0, 0, 0, -1, -3, 0, 1, 0, 0.3, 0, 0, 0, 1], "fov": 30, "aspect": 1}
 
 
@@ -79,11 +79,6 @@ def ffmpeg(tmp_path, monkeypatch):
         monkeypatch.setenv("PATH", str(program.parent), prepend=":")
 
 
-def test_eval(call, tmp_path):
-    call("ns-eval", "--output-path", tmp_path / "eval.json")
-    assert 0 < json.loads((tmp_path / "eval.json").read_text())["results"]["sam"] < 0.2
-
-
 @pytest.mark.parametrize("typed", ["", "{}/apple"])
 def test_a_run_is_evaluated_and_rendered_where_it_lies(call, tmp_path, monkeypatch, typed):
     """It was moved; in the working folder, and where it lay, the paths that were typed are another run's."""
@@ -117,7 +112,7 @@ def test_a_run_is_evaluated_and_rendered_where_it_lies(call, tmp_path, monkeypat
     [
         (("cameras",), "transforms_train.json"),
         (("tsdf", "--resolution", "32", *TEXTURE), "tsdf_mesh.ply"),
-        (("poisson", "--num-points", "2000", "--num-rays-per-batch", "1024", *TEXTURE), "poisson_mesh.ply"),
+        (("poisson", "--num-points", "1000", "--num-rays-per-batch", "1024", *TEXTURE), "poisson_mesh.ply"),
     ],
 )
 def test_exports(call, tmp_path, words, written):

@@ -77,10 +77,14 @@ def test_nonsense_is_one_sentence(config, told):
     ],
 )
 def test_words_for_a_step_are_refused_before_the_first(settings, told):
-    check_words(SessionSettings(process="--masks.pieces 2", traits="--index PRI --roi a 0 0 0 0.01"))
-    check_words(SessionSettings(traits="--index 'CRI = 1/R510 - 1/R550' --index own=R510"))
     with pytest.raises(InputError, match=told):
         check_words(settings)
+
+
+@pytest.mark.slow
+def test_words_that_a_step_knows_pass():
+    check_words(SessionSettings(process="--masks.pieces 2", traits="--index PRI --roi a 0 0 0 0.01"))
+    check_words(SessionSettings(traits="--index 'CRI = 1/R510 - 1/R550' --index own=R510"))
 
 
 @pytest.mark.slow

@@ -14,15 +14,13 @@ from contextlib import redirect_stdout
 
 import pytest
 from rich.console import Console
+from steps_here import steps_here
 
 from hsi_sc_nerf.batch.session_steps import STEPS_NAME, Step
 from hsi_sc_nerf.benchmark.steps import own_cost
-from hsi_sc_nerf.cli.main import main
-from hsi_sc_nerf.cli.sessions import MarkersCommand
 from hsi_sc_nerf.cli.workflows import DemoCommand, RunCommand, _show_results
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
-from hsi_sc_nerf.nerfstudio_commands import extend_nerfstudio_commands
 
 ALL = ["process", "train", "evaluate", "export", "material", "traits", "report"]
 SIZE = {"size": {"volume_l": 0.226, "height_m": 0.0666, "area_m2": 0.0186}, "watertight": True}
@@ -37,32 +35,18 @@ TRAIN = " ".join(
     (
         "--pipeline.datamanager.train-num-rays-per-batch 256 --pipeline.model.match-resolution False",
         "--pipeline.model.num-levels 8 --pipeline.model.log2-hashmap-size 14 --pipeline.model.max-res 128",
-        "--pipeline.model.proposal-warmup 100 --steps-per-save 20 --evaluate-stages False",
+        "--pipeline.model.proposal-warmup 100 --steps-per-save 10 --evaluate-stages False",
     )
 )
 
 
-OPTIONS = {"max_num_iterations": 150, "num_points": 3000, "train": TRAIN}
+OPTIONS = {"max_num_iterations": 40, "num_points": 1000, "train": TRAIN, "traits": "--mesh.octree-depth 5"}
 
 
 @pytest.fixture(scope="module")
 def run():
-    """The rest of a run in this process, which has nerfstudio imported; gives what it prints."""
-    from nerfstudio.scripts import eval, exporter, train  # noqa: F401
-    from nerfstudio.utils import writer
-
-    extend_nerfstudio_commands()  # as at the end of their import by a console script
-    with pytest.MonkeyPatch.context() as monkeypatch:
-
-        def run_step(name, argv, log):
-            """A process has a program after ``-c``, or our module after ``-m``."""
-            _, kind, program, *words = argv
-            monkeypatch.setattr(sys, "argv", [program, *words])
-            monkeypatch.setattr(writer, "EVENT_WRITERS", [])  # those of other runs in this process
-            started = time.perf_counter()
-            with log.open("w") as output, redirect_stdout(output):
-                main() if kind == "-m" else exec(program, {})
-            return own_cost(name, started)
+    """The rest of a run in this process; gives what it prints."""
+    with steps_here() as run_step:
 
         def run(session, out):
             printed = io.StringIO()
@@ -194,34 +178,23 @@ def done_steps(out):
     return {name for name, entry in steps.items() if entry["finished"]}
 
 
-def test_a_step_depends_on_its_words_and_files(tmp_path):
+def test_results_that_lie_in_the_session_are_no_input(tmp_path):
     session, out = tmp_path / "session", tmp_path / "session" / "out"
     out.mkdir(parents=True)
     (session / "a.raw").write_bytes(b"1")
     step = Step("process", ("hsi-sc-nerf", "process"), (session,), ())
     first = step.fingerprint(out)
-    (out / "b.raw").write_bytes(b"1")  # its own results are no input
+    (out / "b.raw").write_bytes(b"1")
     assert step.fingerprint(out) == first
-    assert Step("process", ("hsi-sc-nerf", "process", "--poses"), (session,), ()).fingerprint(out) != first
-    (session / "a.raw").write_bytes(b"12")
-    assert step.fingerprint(out) != first
 
 
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        ("run s --output-dir o", "Stopped; the same command goes on where it stopped."),
-        ("markers", "Stopped."),
-    ],
-)
-def test_ctrl_c_is_one_line(monkeypatch, capsys, command, words, told):
+def test_ctrl_c_is_one_line_that_says_what_goes_on(monkeypatch, capsys, command):
     def interrupted(self):
         raise KeyboardInterrupt
 
-    for made in (RunCommand, MarkersCommand):
-        monkeypatch.setattr(made, "main", interrupted)
-    assert command(*words.split()) == 130
-    assert capsys.readouterr().err == f"{told}\n"
+    monkeypatch.setattr(RunCommand, "main", interrupted)
+    assert command("run", "s", "--output-dir", "o") == 130
+    assert capsys.readouterr().err == "Stopped; the same command goes on where it stopped.\n"
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path):

@@ -9,9 +9,6 @@ import torch
 from hsi_sc_nerf.evaluation import spectral_metrics as metrics
 
 H, W, BANDS = 17, 23, 5
-SCORERS = pytest.mark.parametrize(
-    "score", [metrics.spectral_metrics, metrics.spectral_angle_mapper, metrics.spectral_rmse]
-)
 
 
 def pair() -> tuple[torch.Tensor, torch.Tensor]:
@@ -186,15 +183,17 @@ def test_metrics_are_finite(scale: float, dtype: torch.dtype, device: str) -> No
         assert metrics.spectral_rmse(predicted, against, mask).dtype == torch.float32
 
 
-@SCORERS
-def test_images_and_masks_that_do_not_fit_are_refused(score) -> None:
+@pytest.mark.parametrize("score", [metrics.spectral_metrics, metrics.spectral_angle_mapper, metrics.spectral_rmse])
+def test_images_masks_and_validities_that_do_not_fit_are_refused(score) -> None:
     predicted, target = pair()
     with pytest.raises(ValueError, match="differ in shape"):
         score(predicted, target[..., :1])
-    with pytest.raises(ValueError, match="mask"):
-        score(predicted, target, blob()[1:])
-    with pytest.raises(ValueError, match="mask"):
-        score(predicted, target, blob().float())
+    for mask in (blob()[1:], blob().float()):
+        with pytest.raises(ValueError, match="mask"):
+            score(predicted, target, mask)
+    for valid in (blob(), some_valid().float(), some_valid()[..., :1]):
+        with pytest.raises(ValueError, match="the validity of values of shape"):
+            score(predicted, target, blob(), valid)
 
 
 def test_pixels_outside_the_mask_may_be_anything() -> None:
@@ -203,13 +202,6 @@ def test_pixels_outside_the_mask_may_be_anything() -> None:
     predicted[~blob()] = float("nan")
     found = metrics.spectral_metrics(predicted, target, blob())
     assert all(found[name] == expected[name] for name in found if name != "ssim_windowed")
-
-
-@MASKS
-def test_everything_valid_changes_nothing(mask: torch.Tensor | None) -> None:
-    predicted, target = pair()
-    found = metrics.spectral_metrics(predicted, target, mask, torch.ones(H, W, BANDS, dtype=torch.bool))
-    assert found == pytest.approx(metrics.spectral_metrics(predicted, target, mask), rel=1e-6)
 
 
 @pytest.mark.parametrize("anything", [-7.0, float("nan")])
@@ -253,14 +245,6 @@ def test_blocks_and_precision_change_nothing_but_rounding(monkeypatch: pytest.Mo
     )
     monkeypatch.setattr(metrics, "BLOCK_VALUES", 2 * W * BANDS)
     assert metrics.spectral_metrics(*images, blob(), some_valid()) == pytest.approx(whole, rel=1e-6)
-
-
-@SCORERS
-def test_a_validity_that_does_not_fit_is_refused(score) -> None:
-    predicted, target = pair()
-    for valid in (blob(), some_valid().float(), some_valid()[..., :1]):
-        with pytest.raises(ValueError, match="the validity of values of shape"):
-            score(predicted, target, blob(), valid)
 
 
 def test_regions_are_scored_as_if_alone() -> None:

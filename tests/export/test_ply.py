@@ -17,7 +17,6 @@ from hsi_sc_nerf.export.cloud import (
     stream,
     write_spectral_ply,
 )
-from hsi_sc_nerf.geometry.ply_file import ply_triangles
 
 
 @pytest.mark.parametrize(("count", "chunk"), [(50, 7), (50, 1000), (0, 7)])
@@ -150,10 +149,3 @@ def test_bad_files_are_refused_in_one_sentence(tmp_path: Path, spoil, message: s
     with pytest.raises(InputError, match=message) as caught:
         read_spectral_ply(path)
     assert str(path) in str(caught.value)
-
-
-def test_a_mesh_keeps_its_triangles_and_its_spectra(tmp_path: Path) -> None:
-    triangles = np.array([[0, 1, 2], [3, 2, 1]])
-    write_spectral_ply(tmp_path / "mesh.ply", random_cloud(4), triangles)
-    np.testing.assert_array_equal(ply_triangles(PlyData.read(str(tmp_path / "mesh.ply"))), triangles)
-    assert_equal(read_spectral_ply(tmp_path / "mesh.ply"), random_cloud(4))

@@ -2,11 +2,13 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch.nn import functional
 
 from hsi_sc_nerf.fields.camera_shading import LIMB, CameraShading, smoothed_grid
+from hsi_sc_nerf.geometry.camera import look_at, turntable_camera_to_world
 
 SHAPE, CELL, RADIUS = (48, 48, 40), 0.05, 0.7
 LOWER = torch.tensor([-1.2, -1.2, -1.0])
@@ -15,13 +17,8 @@ CHANNELS = 3
 
 def pose(azimuth_deg: float) -> torch.Tensor:
     """Camera 3 units from the axis, 1 above the middle, which looks at it."""
-    a = math.radians(azimuth_deg)
-    eye = torch.tensor([3.0 * math.cos(a), 3.0 * math.sin(a), 1.0])
-    back = functional.normalize(eye, dim=0)
-    right = torch.tensor([-math.sin(a), math.cos(a), 0.0])
-    made = torch.eye(4)
-    made[:3] = torch.stack([right, torch.linalg.cross(back, right), back, eye], dim=-1)
-    return made
+    first = look_at(np.array([3.0, 0.0, 1.0]), np.zeros(3))
+    return torch.from_numpy(turntable_camera_to_world(first, -azimuth_deg)).float()
 
 
 def ball_opacity() -> torch.Tensor:

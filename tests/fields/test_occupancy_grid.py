@@ -1,6 +1,7 @@
 """The occupancy grid begins as the hull of a known ball, and follows a field's density."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -26,15 +27,10 @@ def ball(tmp_path_factory):
     return open_packed(write_ball_dataset(tmp_path_factory.mktemp("ball")))
 
 
-class WithoutMask:
+def without_mask(dataset):
     """The first frame with an empty mask."""
-
-    def __init__(self, dataset):
-        self.camera_to_world = dataset.frames[0].camera_to_world
-        self.shape = dataset.intrinsics.h, dataset.intrinsics.w
-
-    def mask(self):
-        return np.zeros(self.shape, bool)
+    empty = np.zeros((dataset.intrinsics.h, dataset.intrinsics.w), bool)
+    return SimpleNamespace(camera_to_world=dataset.frames[0].camera_to_world, mask=lambda: empty)
 
 
 def centres_m(lower_m):
@@ -75,7 +71,7 @@ def test_masks_that_miss_the_object_in_a_few_frames_cut_nothing_off(ball):
     lower_m = ball.scene_box_m[0]
     frames = ball.frames * 2
     whole, solid = bounds_from_masks(ball, frames, SHAPE, lower_m, CELL_M)
-    cut, solid_cut = bounds_from_masks(ball, [WithoutMask(ball)] * 3 + list(frames[3:]), SHAPE, lower_m, CELL_M)
+    cut, solid_cut = bounds_from_masks(ball, [without_mask(ball)] * 3 + list(frames[3:]), SHAPE, lower_m, CELL_M)
     assert (cut & whole).sum() > 0.95 * whole.sum()
     # What begins solid is agreed on by nearly all masks.
     assert solid.any()
@@ -83,7 +79,7 @@ def test_masks_that_miss_the_object_in_a_few_frames_cut_nothing_off(ball):
 
 
 def test_without_a_hull_all_may_hold_matter(ball):
-    matter, solid = bounds_from_masks(ball, [WithoutMask(ball)] * 4, SHAPE, ball.scene_box_m[0], CELL_M)
+    matter, solid = bounds_from_masks(ball, [without_mask(ball)] * 4, SHAPE, ball.scene_box_m[0], CELL_M)
     assert matter.all()
     assert not solid.any()
 
@@ -101,6 +97,14 @@ def box():
     return torch.tensor([[-1.0, -1.0, -0.5], [1.0, 1.0, 0.5]])
 
 
+def grid_with(*matter, solid=None):
+    """Over the box, with matter in these cells."""
+    cells, begins_solid = (torch.zeros(grid_over(box())[0], dtype=torch.bool) for _ in range(2))
+    cells[matter] = True
+    begins_solid[matter if solid is None else solid] = True
+    return OccupancyGrid(box(), cells, begins_solid)
+
+
 def test_grid_covers_the_box():
     shape, cell = grid_over(box())
     assert shape == (GRID_CELLS, GRID_CELLS, GRID_CELLS // 2)
@@ -108,23 +112,17 @@ def test_grid_covers_the_box():
 
 
 def test_refreshed_cells_are_as_opaque_as_the_field_and_others_stay_empty():
-    shape, cell = grid_over(box())
-    matter = torch.zeros(shape, dtype=torch.bool)
-    matter[24:40] = True
-    grid = OccupancyGrid(box(), matter, matter)
+    grid = grid_with(slice(24, 40))
     torch.manual_seed(0)
     grid.refresh_all(lambda points: torch.where(points[:, :1] < -0.5, 100.0, 0.0))
-    expected = 1.0 - np.exp(-100.0 * cell)
+    expected = 1.0 - np.exp(-100.0 * grid.cell)
     assert (grid.opacity[40:] == -1.0).all()
     np.testing.assert_allclose(grid.opacity[24:31].numpy(), expected, rtol=0.1)
     np.testing.assert_allclose(grid.opacity[33:40].numpy(), 0.0, atol=1e-6)
 
 
 def test_a_cell_with_one_dense_point_is_thin():
-    shape, _ = grid_over(box())
-    matter = torch.zeros(shape, dtype=torch.bool)
-    matter[:16] = True
-    grid = OccupancyGrid(box(), matter, matter)
+    grid = grid_with(slice(16))
     torch.manual_seed(0)
     for step in range(0, 320, 8):
         grid.refresh(lambda points: torch.where(torch.rand(len(points), 1) < 0.02, 1e9, 0.0), step)
@@ -132,12 +130,9 @@ def test_a_cell_with_one_dense_point_is_thin():
 
 
 def test_random_points_lie_in_their_cells():
-    shape, cell = grid_over(box())
-    matter = torch.zeros(shape, dtype=torch.bool)
-    matter[10:20, 10:30, 5:9] = True
-    solid = matter.clone()
-    solid[15:] = False
-    points, is_solid = OccupancyGrid(box(), matter, solid).random_points(4000)
-    x = (points[:, 0] + 1.0) / cell
+    across = slice(10, 30), slice(5, 9)
+    grid = grid_with(slice(10, 20), *across, solid=(slice(10, 15), *across))
+    points, is_solid = grid.random_points(4000)
+    x = (points[:, 0] + 1.0) / grid.cell
     assert ((x >= 10) & (x <= 20)).all()
     assert ((x < 15) == is_solid).float().mean() > 0.999

@@ -25,8 +25,17 @@ from hsi_sc_nerf.capture.session import Session, open_session
 from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.inspection.capture_checks import acquisition_day, check_frames
-from hsi_sc_nerf.inspection.inspect import Inspection, draw_inspection, filled_in, inspect_session, is_named
+from hsi_sc_nerf.inspection.inspect import (
+    Inspection,
+    check_angles,
+    draw_inspection,
+    filled_in,
+    inspect_session,
+    is_named,
+)
 from hsi_sc_nerf.inspection.marker_checks import Markers
+
+SEEN = Markers("DICT_5X5_50", [{}] * 12, np.arange(12) * 30.0, 0, 20.0, 0.1)
 
 
 def inspect(path: Path) -> tuple[Inspection, dict[str, Finding]]:
@@ -188,10 +197,16 @@ def test_a_blurred_frame_without_markers_is_amber(session):
         ({"nominal_step_deg": 30}, "angles", None),
     ],
 )
-def test_angles_that_poses_need_are_asked_for_before_any_computing(session, stated, poses, level):
+def test_angles_that_poses_need_are_asked_for(session, stated, poses, level):
     (session / "session.json").write_text(json.dumps({**INFO, **stated}))
-    findings = inspect_session(open_session(session), poses).findings
-    assert [f.level for f in findings if f.name == "angles"] == ([] if level is None else [level])
+    findings = check_angles(open_session(session), poses, SEEN)
+    assert [(f.name, f.level) for f in findings] == ([] if level is None else [("angles", level)])
+
+
+def test_angles_are_asked_for_before_any_computing(session):
+    (session / "session.json").write_text(json.dumps({**INFO, "frame_angles_deg": [0, 30]}))
+    findings = inspect_session(open_session(session), "angles").findings
+    assert [f.level for f in findings if f.name == "angles"] == ["red"]
 
 
 @pytest.mark.parametrize(
@@ -206,10 +221,9 @@ def test_angles_that_poses_need_are_asked_for_before_any_computing(session, stat
 )
 def test_the_place_of_a_capture_that_is_left_out_is_stated(session, name, stated, poses, level):
     (session / "session.json").write_text(json.dumps({**INFO, "nominal_step_deg": None, **stated}))
-    findings = inspect_session(open_session(session, exclude=[name]), poses).findings
-    angles = [finding for finding in findings if finding.name == "angles"]
-    assert [finding.level for finding in angles] == ([] if level is None else [level])
-    for finding in angles:
+    findings = check_angles(open_session(session, exclude=[name]), poses, SEEN)
+    assert [finding.level for finding in findings] == ([] if level is None else [level])
+    for finding in findings:
         assert name in finding.sentence
         assert finding.values["fruit_06"] == 180.0
 

@@ -22,6 +22,7 @@ def process(session: Path, output: Path, **settings) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("blank_figures")
 def test_red_is_refused_before_anything_is_written_unless_it_is_accepted_or_left_out(session, tmp_path):
     image = frame_picture(np.full((SIZE_PX, SIZE_PX), 90.0))
     write_one(session, "fruit_05", image, **{"acquisition date": "15-02-2021"})
@@ -45,6 +46,7 @@ def test_a_file_and_the_session_itself_are_no_folder_for_the_dataset(session, tm
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("blank_figures")
 def test_all_damaged_captures_are_named_or_left_out(session, tmp_path):
     (session / "fruit_02" / "capture" / "fruit_02.raw").write_bytes(b"")
     shutil.rmtree(session / "fruit_08" / "capture")

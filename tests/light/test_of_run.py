@@ -61,6 +61,16 @@ def open_lit_ball(root, lit):
     return run
 
 
+@pytest.fixture(scope="module", autouse=True)
+def fewer_elements():
+    """A ball is smooth: fewer elements and rays than a fruit needs show its light."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hsi_sc_nerf.light.of_run.ELEMENTS", 600)
+        patch.setattr("hsi_sc_nerf.light.of_run.SUPPORT_ELEMENTS", 240)
+        patch.setattr("hsi_sc_nerf.light.material.RAY_DIRECTIONS", 1024)
+        yield
+
+
 @pytest.fixture(scope="module")
 def lit(tmp_path_factory):
     return light_of_run(open_lit_ball(tmp_path_factory.mktemp("lit"), lit=True), FACING)
@@ -94,11 +104,19 @@ def upper_cloud(found, lit):
     return cloud.select((cosines.max(axis=1) > 0.5) & (normals[:, 2] > 0.2))
 
 
+@pytest.fixture(scope="module")
+def cloud(lit):
+    return upper_cloud(lit, lit=True)
+
+
+@pytest.fixture(scope="module")
+def corrected(lit, cloud):
+    return with_material(cloud, lit, factory.WAVELENGTHS_NM, corrected=True)
+
+
 @pytest.mark.slow
-def test_a_lamp_on_a_run_is_found_and_divided_out(lit):
+def test_a_lamp_on_a_run_is_found_and_divided_out(lit, cloud, corrected):
     assert lit.evidence.shaded
-    cloud = upper_cloud(lit, lit=True)
-    corrected = with_material(cloud, lit, factory.WAVELENGTHS_NM, corrected=True)
     assert list(corrected.extra)[-2:] == ["irradiance", "irradiance_std"]
     by_band, std = lit.irradiance(cloud.points.astype(float))
     for band, name in enumerate(list(corrected.extra)[: factory.BANDS]):
@@ -131,13 +149,10 @@ def test_points_just_above_the_surface_that_an_object_stands_on_are_uncertain(li
 
 
 @pytest.mark.slow
-def test_gloss_is_taken_off_before_the_light_and_has_a_column(lit):
+def test_gloss_is_taken_off_before_the_light_and_has_a_column(lit, cloud, corrected):
     gloss = Gloss(0.04, 0.002, np.zeros((2 * HALF, 2 * HALF)))
     glossy = replace(lit, light=replace(lit.light, fit=replace(lit.light.fit, gloss=gloss)))
-    cloud = upper_cloud(lit, lit=True)
-    matte, corrected = (
-        with_material(cloud, found, factory.WAVELENGTHS_NM, corrected=True) for found in (lit, glossy)
-    )
+    matte, corrected = corrected, with_material(cloud, glossy, factory.WAVELENGTHS_NM, corrected=True)
     assert list(corrected.extra)[-1] == "gloss"
     # An even chamber that gives a part of the light is mirrored alike everywhere.
     chamber = lit.stationary.light.chamber[0]
@@ -210,9 +225,7 @@ def test_the_view_is_the_best_of_those_that_see_the_point(even):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("file_format", ["ply", "netcdf"])
-def test_files_hold_reflectance_as_measured_and_of_the_material(lit, tmp_path, file_format):
-    cloud = upper_cloud(lit, lit=True)
-    corrected = with_material(cloud, lit, factory.WAVELENGTHS_NM, corrected=True)
+def test_files_hold_reflectance_as_measured_and_of_the_material(lit, cloud, corrected, tmp_path, file_format):
     path = write_cloud(tmp_path / "cloud", stream(corrected), file_format)
     if file_format == "ply":
         read = read_spectral_ply(path)
@@ -232,9 +245,8 @@ def test_files_hold_reflectance_as_measured_and_of_the_material(lit, tmp_path, f
 
 
 @pytest.mark.slow
-def test_the_light_of_a_file_is_taken_for_what_it_was(lit, tmp_path):
-    cloud = upper_cloud(lit, lit=True)
-    told = light_summary(lit, with_material(cloud, lit, factory.WAVELENGTHS_NM, corrected=True), corrected=True)
+def test_the_light_of_a_file_is_taken_for_what_it_was(lit, cloud, corrected, tmp_path):
+    told = light_summary(lit, corrected, corrected=True)
     write_json(tmp_path / "cloud-material.json", told)
     # The white reference's direction is that of the file's session.
     taken = light_of_run(lit.run, -FACING, read_light(tmp_path / "cloud-material.json"))
@@ -245,29 +257,31 @@ def test_the_light_of_a_file_is_taken_for_what_it_was(lit, tmp_path):
 
 
 @pytest.mark.slow
-def test_shade_that_is_not_corrected_has_no_stated_uncertainty(lit):
-    same = with_material(upper_cloud(lit, lit=True), lit, factory.WAVELENGTHS_NM, corrected=False)
+def test_shade_that_is_not_corrected_has_no_stated_uncertainty(lit, cloud):
+    same = with_material(cloud, lit, factory.WAVELENGTHS_NM, corrected=False)
     assert np.isnan(same.extra["irradiance_std"]).all()
     assert light_summary(lit, same, corrected=False)["relative_std"] is None
 
 
-@pytest.mark.parametrize(
-    ("std", "corrected", "warned"),
-    [(0.12, True, True), (0.02, True, False), (None, False, False), (None, True, True)],
-)
-def test_light_that_is_too_uncertain_is_warned_of(std, corrected, warned):
-    evidence = {"profile": 0.7, "profile_std": 0.1}
-    told = {"evidence": evidence, "shaded": True, "corrected": corrected, "relative_std": std}
-    assert any(line.startswith("Warning") for line in sentences(told)) == warned
+EVIDENCE = {"profile": 0.7, "profile_std": 0.1}
+OF_ANOTHER = {"relative_std": 0.02, "light_from": "b.json"}
 
 
 @pytest.mark.parametrize(
-    ("turning", "light_from", "warned"), [(1.02, "b.json", 0), (0.8, "b.json", 1), (0.8, None, 0)]
+    ("told", "words", "warned"),
+    [
+        ({"relative_std": 0.12}, "Warning", 1),
+        ({"relative_std": 0.02}, "Warning", 0),
+        ({"relative_std": None}, "Warning", 1),
+        ({"relative_std": None, "corrected": False}, "Warning", 0),
+        ({**OF_ANOTHER, "evidence": {**EVIDENCE, "turning": 1.02}}, "b.json", 0),
+        ({**OF_ANOTHER, "evidence": {**EVIDENCE, "turning": 0.8}}, "b.json", 1),
+        ({"relative_std": 0.02, "light_from": None, "evidence": {**EVIDENCE, "turning": 0.8}}, "b.json", 0),
+    ],
 )
-def test_the_light_of_another_chamber_is_warned_of(turning, light_from, warned):
-    evidence = {"profile": 0.7, "profile_std": 0.1, "turning": turning}
-    told = {"evidence": evidence, "shaded": True, "corrected": True, "relative_std": 0.02, "light_from": light_from}
-    assert sum("b.json" in line for line in sentences(told)) == warned
+def test_light_that_is_too_uncertain_or_of_another_chamber_is_warned_of(told, words, warned):
+    lines = sentences({"evidence": EVIDENCE, "shaded": True, "corrected": True, **told})
+    assert sum(words in line for line in lines) == warned
 
 
 @pytest.mark.parametrize(
@@ -277,11 +291,9 @@ def test_an_unknown_container_is_warned_of(container, lowest_m, warned):
     dataset = SimpleNamespace(
         container=container, object_box_m=np.array([[-0.04, -0.04, lowest_m], [0.04, 0.04, 0.2]])
     )
-    found = RunLight(SimpleNamespace(dataset=dataset), *[None] * 5)
-    evidence = {"profile": 0.7, "profile_std": 0.1}
-    told = {"evidence": evidence, "shaded": True, "corrected": True, "relative_std": 0.02}
-    lines = sentences({**told, "support_unknown": found.support_unknown})
-    assert sum("container_height_m" in line for line in lines if line.startswith("Warning")) == warned
+    unknown = RunLight(SimpleNamespace(dataset=dataset), *[None] * 5).support_unknown
+    told = {"evidence": EVIDENCE, "shaded": True, "corrected": True, "relative_std": 0.02, "support_unknown": unknown}
+    assert sum("container_height_m" in line for line in sentences(told) if line.startswith("Warning")) == warned
 
 
 @pytest.mark.slow

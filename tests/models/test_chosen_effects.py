@@ -16,6 +16,8 @@ from hsi_sc_nerf.models.chosen_effects import MODEL_EFFECTS, chosen_effects, eff
 from hsi_sc_nerf.models.spectral_model import SpectralModelConfig
 from hsi_sc_nerf.packed.dataset import open_packed, write_transforms
 
+pytestmark = pytest.mark.usefixtures("quick_start")
+
 
 def effect(name, present):
     return EffectEvidence(name, present, 2.0, 0.1, 1.0, "%", "A sentence.")

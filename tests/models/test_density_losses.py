@@ -1,24 +1,9 @@
+"""Matter that is in the way of the chamber; the distortion has its tests in test_training_functions.py."""
+
 import pytest
 import torch
 
-from hsi_sc_nerf.models.density_losses import free_space_loss, separate_distortion
-
-
-def test_distortion_equals_nerfstudios_where_samples_touch() -> None:
-    from nerfstudio.model_components.losses import lossfun_distortion
-
-    torch.manual_seed(0)
-    edges = torch.rand(20, 9).sort(dim=-1).values.double()
-    weights = torch.rand(20, 8).double()
-    expected = lossfun_distortion(edges, weights)
-    torch.testing.assert_close(separate_distortion(weights, edges[:, :-1], edges[:, 1:]), expected)
-
-
-def test_distortion_of_samples_apart_counts_the_gap() -> None:
-    weights, starts = torch.tensor([[0.5, 0.5]]), torch.tensor([[0.0, 3.0]])
-    # Twice 0.5 x 0.5 over a distance of 3, and 0.25 x 0.1 / 3 within each.
-    expected = 2 * 0.25 * 3.0 + 2 * 0.25 * 0.1 / 3
-    assert separate_distortion(weights, starts, starts + 0.1).item() == pytest.approx(expected)
+from hsi_sc_nerf.models.density_losses import free_space_loss
 
 
 def test_matter_above_the_support_beside_the_object_costs_its_weight() -> None:

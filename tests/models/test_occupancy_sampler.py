@@ -16,6 +16,7 @@ from hsi_sc_nerf.packed.dataset import open_packed
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 
 
+@pytest.fixture(scope="module")
 def ball_grid():
     shape, cell = grid_over(BOX)
     centres = BOX[0] + cell * (torch.from_numpy(np.indices(shape)).permute(1, 2, 3, 0) + 0.5)
@@ -34,8 +35,8 @@ def rays_along_x(y):
     )
 
 
-def test_only_rays_that_meet_matter_are_sampled():
-    sampler = OccupancySampler(ball_grid(), num_samples=8)
+def test_only_rays_that_meet_matter_are_sampled(ball_grid):
+    sampler = OccupancySampler(ball_grid, num_samples=8)
     rays = rays_along_x(torch.tensor([-0.9, -0.3, 0.0, 0.7]))
     samples, *proposals = sampler(rays)
     assert proposals == [[], []]
@@ -51,36 +52,35 @@ def test_only_rays_that_meet_matter_are_sampled():
 
 
 @pytest.mark.parametrize(("in_training", "expected"), [(None, 8), (3, 3), (20, 8)])
-def test_a_stage_may_train_with_fewer_samples_but_renders_with_all(in_training, expected):
-    sampler = OccupancySampler(ball_grid(), num_samples=8)
+def test_a_stage_may_train_with_fewer_samples_but_renders_with_all(ball_grid, in_training, expected):
+    sampler = OccupancySampler(ball_grid, num_samples=8)
     sampler.samples_in_training = in_training
     rays = rays_along_x(torch.tensor([0.0]))
     assert sampler.train()(rays)[0].frustums.shape == (1, expected)
     assert sampler.eval()(rays)[0].frustums.shape == (1, 8)
 
 
-def test_a_bundle_that_meets_nothing_keeps_one_ray_without_length():
-    sampler = OccupancySampler(ball_grid(), num_samples=8)
+def test_a_bundle_that_meets_nothing_keeps_one_ray_without_length(ball_grid):
+    sampler = OccupancySampler(ball_grid, num_samples=8)
     samples, *_ = sampler(rays_along_x(torch.tensor([0.9, -0.8])))
     assert samples.frustums.shape == (1, 8)
     assert (samples.deltas == 0.0).all()
 
 
-def test_every_ray_is_sampled_where_that_is_wanted():
-    sampler = OccupancySampler(ball_grid(), num_samples=8, every_ray=True)
+def test_every_ray_is_sampled_where_that_is_wanted(ball_grid):
+    sampler = OccupancySampler(ball_grid, num_samples=8, every_ray=True)
     samples, *_ = sampler(rays_along_x(torch.tensor([0.9, 0.0])))
     assert samples.frustums.shape == (2, 8)
     assert samples.deltas.sum(dim=1).flatten().tolist() == pytest.approx([0.0, 1.2 * 8 / 9], abs=0.05)
 
 
 @pytest.mark.slow
-def test_the_field_begins_solid_inside_the_hull():
+def test_the_field_begins_solid_inside_the_hull(ball_grid):
     torch.manual_seed(0)
-    grid = ball_grid()
     field = SpectralField(
         BOX, num_bands=3, num_images=1, num_levels=8, max_res=64, log2_hashmap_size=14, implementation="torch"
     )
-    field.start_solid(grid.random_points)
+    field.start_solid(ball_grid.random_points)
     radius = torch.tensor([0.0, 0.2, 0.4, 0.57])
     points = torch.nn.functional.normalize(torch.randn(500, 1, 3), dim=-1) * radius[:, None]
     with torch.no_grad():

@@ -10,6 +10,8 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from odd_runs import CASES, simulated, train
 
+pytestmark = pytest.mark.usefixtures("quick_start")
+
 STOPS = {"all masks empty": "the masks of all training frames are empty", "two dead bands": "free of flagged values"}
 ENDS = [
     "1 band",

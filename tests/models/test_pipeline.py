@@ -18,6 +18,8 @@ from hsi_sc_nerf.models.pipeline import SpectralPipeline, digest_of_frames
 from hsi_sc_nerf.packed.cube import FLAGGED
 from hsi_sc_nerf.packed.dataset import open_packed, write_transforms
 
+pytestmark = pytest.mark.usefixtures("quick_start")
+
 
 def view(pixels, valid=None):
     shown = torch.zeros(2, 2, 1)
@@ -74,7 +76,7 @@ def pipeline_config(data):
     return config
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def pipeline(flagged_dataset) -> SpectralPipeline:
     return pipeline_config(flagged_dataset).setup(device="cpu")
 
@@ -210,16 +212,17 @@ def test_frames_are_told_by_their_names_their_order_and_those_that_are_held_out(
     )
 
 
-def test_a_basis_has_no_spectrum_at_the_last_sample(flagged_dataset):
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"head": "basis"}, "head direct"),
+        ({"head": "direct", "num_proposal_iterations": 0}, "num-proposal-iterations"),
+    ],
+)
+def test_a_basis_and_an_occupancy_grid_have_no_last_sample_behind_the_object(flagged_dataset, changes, told):
     config = pipeline_config(flagged_dataset).model
-    with pytest.raises(SystemExit, match=r"--pipeline\.model\.head direct"):
-        replace(config, head="basis", background="last-sample")
-
-
-def test_an_occupancy_grid_has_no_sample_behind_the_object(flagged_dataset):
-    config = pipeline_config(flagged_dataset).model
-    with pytest.raises(SystemExit, match=r"--pipeline\.model\.num-proposal-iterations"):
-        replace(config, head="direct", background="last-sample", num_proposal_iterations=0)
+    with pytest.raises(SystemExit, match=rf"--pipeline\.model\.{told}"):
+        replace(config, background="last-sample", **changes)
 
 
 @pytest.mark.slow

@@ -6,6 +6,8 @@ from small_trainer import STEPS, trainer
 
 from hsi_sc_nerf.config import hsi_sc_nerf
 
+pytestmark = pytest.mark.usefixtures("quick_start")
+
 
 def state(model):
     return {name: value.clone() for name, value in model.camera_optimizer.state_dict().items()}

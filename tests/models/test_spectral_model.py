@@ -5,27 +5,9 @@ import pytest
 import torch
 from small_trainer import untrained_pipeline
 
-from hsi_sc_nerf.models.compositing import BasisDecoder, SpectralRenderer
+from hsi_sc_nerf.models.compositing import BasisDecoder
 
-
-@pytest.fixture
-def samples():
-    generator = torch.Generator().manual_seed(0)
-    return torch.rand(2, 3, 5, generator=generator), 0.3 * torch.rand(2, 3, 1, generator=generator)
-
-
-def test_the_sum_is_the_sum(samples):
-    spectra, weights = samples
-    expected = sum(weights[:, k] * spectra[:, k] for k in range(3))
-    torch.testing.assert_close(SpectralRenderer()(rgb=spectra, weights=weights), expected)
-
-
-def test_what_is_let_through_shows_the_last_sample(samples):
-    spectra, weights = samples
-    even = torch.full_like(spectra, 0.4)
-    torch.testing.assert_close(SpectralRenderer(last_sample_behind=True)(rgb=even, weights=weights), even[:, 0])
-    nothing = SpectralRenderer(last_sample_behind=True)(rgb=spectra, weights=torch.zeros_like(weights))
-    torch.testing.assert_close(nothing, spectra[:, -1])
+pytestmark = pytest.mark.usefixtures("quick_start")
 
 
 def test_decoding_commutes_with_compositing(device):

@@ -10,13 +10,15 @@ from clock_by_hand import time_by_hand
 from nerfstudio.configs.base_config import MachineConfig
 from nerfstudio.utils import profiler, writer
 from scipy.ndimage import distance_transform_edt
-from small_trainer import STEPS, trainer
+from small_trainer import trainer
 
 from hsi_sc_nerf.config import hsi_sc_nerf
 from hsi_sc_nerf.models import staged_trainer
 from hsi_sc_nerf.models.checkpoints import allow_nerfstudio_checkpoints
 from hsi_sc_nerf.models.stages import StageConfig, full_frame_stage, masked_stage
 from hsi_sc_nerf.packed.pixels import BOUNDARY_PX
+
+pytestmark = pytest.mark.usefixtures("quick_start")
 
 
 @pytest.mark.slow
@@ -90,7 +92,7 @@ def test_what_a_stage_says_holds_in_it_alone(tiny_dataset, tmp_path, monkeypatch
 
 @pytest.mark.slow
 def test_normals_are_predicted_where_an_occupancy_grid_places_the_samples(tiny_dataset, tmp_path):
-    made = trainer(tiny_dataset, tmp_path, predict_normals=True)
+    made = trainer(tiny_dataset, tmp_path, predict_normals=True, max_num_iterations=2)
     weights = made.pipeline.model.field.mlp_pred_normals.layers[0].weight
     before = weights.clone()
     made.train()
@@ -146,11 +148,11 @@ def test_a_poisoned_step_is_skipped_and_named(tiny_dataset, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_a_loss_that_is_not_finite_is_named_even_if_its_gradient_is(tiny_dataset, tmp_path, capsys):
-    made = trainer(tiny_dataset, tmp_path)
+    made = trainer(tiny_dataset, tmp_path, max_num_iterations=2)
     original = made.pipeline.model.get_loss_dict
     made.pipeline.model.get_loss_dict = lambda *words: original(*words) | {"odd_loss": torch.tensor(float("inf"))}
     made.train()
-    assert "step 2 skipped: loss odd_loss" in capsys.readouterr().out
+    assert "step 1 skipped: loss odd_loss" in capsys.readouterr().out
 
 
 @pytest.mark.slow
@@ -197,15 +199,15 @@ def test_ctrl_c_is_one_line_and_names_the_last_checkpoint(tiny_dataset, tmp_path
     assert [path.name for path in made.checkpoint_dir.iterdir()] == ["step-000000002.ckpt"]
 
 
+def full_disk(*_, **__):
+    raise OSError(28, "No space left on device")
+
+
 @pytest.mark.slow
 def test_a_full_disk_leaves_the_earlier_checkpoint(tiny_dataset, tmp_path, monkeypatch):
     made = trainer(tiny_dataset, tmp_path)
     made.save_checkpoint(0)
     before = list(made.checkpoint_dir.iterdir())
-
-    def full_disk(*arguments, **options):
-        raise OSError(28, "No space left on device")
-
     monkeypatch.setattr(torch, "save", full_disk)
     with pytest.raises(SystemExit, match="No space left"):
         made.save_checkpoint(1)
@@ -229,11 +231,7 @@ def test_a_disk_that_fills_up_in_training_is_one_sentence(
 
 @pytest.mark.slow
 def test_logs_that_cannot_be_written_end_a_run_in_one_sentence(tiny_dataset, tmp_path, monkeypatch):
-    made = trainer(tiny_dataset, tmp_path)
-
-    def full_disk():
-        raise OSError(28, "No space left on device")
-
+    made = trainer(tiny_dataset, tmp_path, max_num_iterations=2)
     monkeypatch.setattr(staged_trainer, "flush_logs", full_disk)
     with pytest.raises(SystemExit, match=rf"^hsi-sc-nerf: {made.base_dir}: [^\n]*No space left[^\n]*--load-dir\.$"):
         made.train()
@@ -244,7 +242,7 @@ def test_logs_that_cannot_be_written_end_a_run_in_one_sentence(tiny_dataset, tmp
 def test_cubes_that_vanish_in_training_are_named_when_they_are_needed(tiny_dataset, tmp_path):
     """Those of training views are open; held-out views are read at the end of a stage."""
     data = shutil.copytree(tiny_dataset[0], tmp_path / "data")
-    made = trainer((data, None), tmp_path, evaluate_stages=True)
+    made = trainer((data, None), tmp_path, max_num_iterations=2, evaluate_stages=True)
     shutil.rmtree(data / "cubes")
     with pytest.raises(SystemExit, match=r"^hsi-sc-nerf: [^\n]*cubes/[^\n]*\.$"):
         made.train()
@@ -286,9 +284,9 @@ def test_a_timed_run_ends_by_the_clock_and_goes_on_from_its_checkpoint(tiny_data
 
 @pytest.mark.slow
 def test_single_steps_run_without_the_loop_of_nerfstudio(tiny_dataset, tmp_path):
-    made = trainer(tiny_dataset, tmp_path)
+    made = trainer(tiny_dataset, tmp_path, max_num_iterations=2)
     made._show_progress = lambda step, psnr_db: None
-    for step in range(STEPS):
+    for step in range(2):
         assert not made.stop_training
         made.train_iteration(step)
     assert made.stop_training

@@ -9,6 +9,8 @@ from small_trainer import untrained_pipeline
 from hsi_sc_nerf.data.camera_rays import QUARTERS
 from hsi_sc_nerf.models.supersampling import mean_over_pixels, outline_pixels, parts_of_pixels, supersampled_view
 
+pytestmark = pytest.mark.usefixtures("quick_start")
+
 
 def test_a_pixels_mean_and_parts_agree_with_a_loop():
     generator = torch.Generator().manual_seed(0)
@@ -39,6 +41,9 @@ def test_the_outline_has_two_sides():
 
 
 SIZE, RADIUS = 24, 0.3
+CAMERA = Cameras(
+    torch.eye(4)[None, :3], fx=24.0, fy=24.0, cx=12.0, cy=12.0, width=SIZE, height=SIZE, camera_type=CameraType(1)
+)
 
 
 def render_disc(rays):
@@ -50,15 +55,12 @@ def render_disc(rays):
 
 
 def test_a_views_outline_shows_the_fraction_that_the_object_covers():
-    camera = Cameras(
-        torch.eye(4)[None, :3], fx=24.0, fy=24.0, cx=12.0, cy=12.0, width=SIZE, height=SIZE, camera_type=CameraType(1)
-    )
-    found = supersampled_view(render_disc, camera, base=-10.0)
+    found = supersampled_view(render_disc, CAMERA, base=-10.0)
     # The fraction of each pixel by many points.
     axis = (np.arange(SIZE * 40) + 0.5) / 40 - SIZE / 2
     covered = np.hypot(axis[:, None], axis[None]) < RADIUS * 24.0
     fraction = covered.reshape(SIZE, 40, SIZE, 40).mean(axis=(1, 3))
-    single = render_disc(camera.generate_rays(0, keep_shape=True))["accumulation"][..., 0].numpy()
+    single = render_disc(CAMERA.generate_rays(0, keep_shape=True))["accumulation"][..., 0].numpy()
     opacity = found["accumulation"][..., 0].numpy()
     assert abs(opacity - fraction).max() < 0.3
     assert np.square(opacity - fraction).sum() < 0.25 * np.square(single - fraction).sum()
@@ -67,8 +69,7 @@ def test_a_views_outline_shows_the_fraction_that_the_object_covers():
 
 
 def test_what_lies_below_the_base_has_no_outline():
-    camera = Cameras(torch.eye(4)[None, :3], fx=24.0, fy=24.0, cx=12.0, cy=12.0, width=SIZE, height=SIZE)
-    found = supersampled_view(render_disc, camera, base=0.0)
+    found = supersampled_view(render_disc, CAMERA, base=0.0)
     assert set(np.unique(found["accumulation"])) == {0.0, 1.0}
 
 

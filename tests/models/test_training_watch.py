@@ -24,6 +24,8 @@ from hsi_sc_nerf.models.training_watch import (
     stage_summary,
 )
 
+pytestmark = pytest.mark.usefixtures("quick_start")
+
 
 def test_names_of_non_finite_terms():
     losses = {"hsi_loss": torch.tensor(1.0), "angular_loss": torch.tensor(float("nan"))}

@@ -13,6 +13,7 @@ from hsi_sc_nerf.geometry.camera import project_distorted
 from hsi_sc_nerf.poses.container_outline import container_outline, radius_by_camera
 
 RADIUS_M, HEIGHT_M, OVER = 0.045, 0.07, 8
+RATIO = HEIGHT_M / RADIUS_M / 2.0
 
 
 @pytest.fixture(scope="module")
@@ -39,16 +40,21 @@ def drawn(scene, shift_m, contrast, k1=0.0):
     return images
 
 
+def standing(turntable, above_lid_m=0.0, **changes):
+    """The machine whose features end this far above the lid."""
+    scene, machine = turntable
+    points_3d = machine.points_3d.copy()
+    lowest_m = np.percentile(points_3d[:, 2], 1.0)
+    points_3d[:, 2] += HEIGHT_M + above_lid_m - scene.first_camera_to_world[2, 3] - lowest_m
+    return replace(machine, points_3d=points_3d, **changes)
+
+
 @pytest.mark.parametrize("ends_m", [0.0, 0.03])
 @pytest.mark.parametrize("shift_m", [0.0, 0.002])
 def test_radius_and_foot_are_those_of_the_drawn_container(turntable, shift_m, ends_m):
     """The features end where the lid is, or well above it."""
-    scene, machine = turntable
-    camera_m = scene.first_camera_to_world[2, 3]
-    points_3d = machine.points_3d.copy()
-    points_3d[:, 2] += HEIGHT_M + ends_m - camera_m - np.percentile(points_3d[:, 2], 1.0)
-    machine = replace(machine, points_3d=points_3d)
-    found = container_outline(drawn(scene, shift_m, 60.0), machine, HEIGHT_M / RADIUS_M / 2.0)
+    scene, camera_m = turntable[0], turntable[0].first_camera_to_world[2, 3]
+    found = container_outline(drawn(scene, shift_m, 60.0), standing(turntable, ends_m), RATIO)
     assert found.radius == pytest.approx(RADIUS_M, rel=2.0 * found.radius_sigma)
     assert found.radius_sigma < 0.015
     assert found.foot == pytest.approx(-camera_m, abs=2.0 * found.foot_sigma)
@@ -56,39 +62,31 @@ def test_radius_and_foot_are_those_of_the_drawn_container(turntable, shift_m, en
 
 
 def test_a_distorted_lens_shows_the_same_container(turntable):
-    scene, machine = turntable
-    camera_m, points_3d = scene.first_camera_to_world[2, 3], machine.points_3d.copy()
-    points_3d[:, 2] += HEIGHT_M - camera_m - np.percentile(points_3d[:, 2], 1.0)
-    machine = replace(machine, points_3d=points_3d, radial=(-2.0, 0.0))
-    found = container_outline(drawn(scene, 0.0, 60.0, machine.radial[0]), machine, HEIGHT_M / RADIUS_M / 2.0)
+    scene, camera_m = turntable[0], turntable[0].first_camera_to_world[2, 3]
+    machine = standing(turntable, radial=(-2.0, 0.0))
+    found = container_outline(drawn(scene, 0.0, 60.0, machine.radial[0]), machine, RATIO)
     assert found.radius == pytest.approx(RADIUS_M, rel=2.0 * found.radius_sigma)
     assert found.foot == pytest.approx(-camera_m, abs=2.0 * found.foot_sigma)
 
 
 def test_pictures_that_lie_on_their_side_show_the_same_container(turntable):
-    scene, machine = turntable
-    points_3d = machine.points_3d.copy()
-    points_3d[:, 2] += HEIGHT_M - scene.first_camera_to_world[2, 3] - np.percentile(points_3d[:, 2], 1.0)
-    machine, images = replace(machine, points_3d=points_3d), drawn(scene, 0.0, 60.0)
+    machine, images = standing(turntable), drawn(turntable[0], 0.0, 60.0)
     quarter = Rotation.from_euler("z", -90.0, True).as_matrix()
     aside = replace(machine, camera_rotation=quarter @ machine.camera_rotation)
-    upright = container_outline(images, machine, HEIGHT_M / RADIUS_M / 2.0)
-    found = container_outline([np.rot90(image) for image in images], aside, HEIGHT_M / RADIUS_M / 2.0)
+    upright = container_outline(images, machine, RATIO)
+    found = container_outline([np.rot90(image) for image in images], aside, RATIO)
     np.testing.assert_allclose(astuple(found), astuple(upright), rtol=1e-3)
 
 
 def test_what_is_hardly_seen_is_not_measured(turntable):
     scene, machine = turntable
-    assert container_outline(drawn(scene, 0.0, 0.0), machine, HEIGHT_M / RADIUS_M / 2.0) is None
+    assert container_outline(drawn(scene, 0.0, 0.0), machine, RATIO) is None
 
 
 @pytest.mark.parametrize("parameter", range(5))
 def test_radius_follows_the_camera_as_its_derivatives_say(turntable, parameter):
     """In the same pictures another camera finds another radius."""
-    scene, machine = turntable
-    images, points_3d = drawn(scene, 0.0, 60.0), machine.points_3d.copy()
-    points_3d[:, 2] += HEIGHT_M - scene.first_camera_to_world[2, 3] - np.percentile(points_3d[:, 2], 1.0)
-    machine = replace(machine, points_3d=points_3d)
+    machine, images = standing(turntable), drawn(turntable[0], 0.0, 60.0)
     step = np.diag([0.03, 0.01, 0.001, 0.005, 0.03])[parameter]
     found = []
     for sign in (-1.0, 1.0):
@@ -99,8 +97,8 @@ def test_radius_follows_the_camera_as_its_derivatives_say(turntable, parameter):
             camera_rotation=turn @ machine.camera_rotation,
             distance=machine.distance * np.exp(sign * step[4]),
         )
-        found.append(container_outline(images, other, HEIGHT_M / RADIUS_M / 2.0).radius)
-    outline = container_outline(images, machine, HEIGHT_M / RADIUS_M / 2.0)
+        found.append(container_outline(images, other, RATIO).radius)
+    outline = container_outline(images, machine, RATIO)
     assert np.log(found[1] / found[0]) == pytest.approx(2.0 * step @ radius_by_camera(outline, machine), abs=0.002)
 
 
@@ -109,4 +107,4 @@ def test_an_object_of_a_pixel_or_one_that_holds_the_camera_has_no_container(turn
     """Wrong poses leave such points."""
     scene, machine = turntable
     machine = replace(machine, points_3d=factor * machine.points_3d)
-    assert container_outline(drawn(scene, 0.0, 60.0), machine, HEIGHT_M / RADIUS_M / 2.0) is None
+    assert container_outline(drawn(scene, 0.0, 60.0), machine, RATIO) is None

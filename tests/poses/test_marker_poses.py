@@ -1,6 +1,7 @@
 """Poses of a turntable from its markers: exact on exact corners, and close to the truth on rendered images."""
 
 import json
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -21,16 +22,18 @@ from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.plotting import COLOURS
 from hsi_sc_nerf.poses.marker_poses import poses_from_markers
+from hsi_sc_nerf.poses.pose_methods import find_poses
 from hsi_sc_nerf.poses.report import angle_words, check_poses, draw_poses, pose_report
 from hsi_sc_nerf.poses.result import is_full_turn
 
 INFO = SessionInfo(marker_side_m=SIDE_M)
+FEW_MARKERS = {"size_px": 128, "frames": 24, "side_markers": 4, "disc_markers": 2}
 
 
 @lru_cache(maxsize=8)
 def estimated(**options):
     scene = MarkerScene(**options)
-    return scene, poses_from_markers(scene.render(), scene.names(), INFO)
+    return scene, find_poses(scene.render(), scene.names(), INFO)
 
 
 @pytest.mark.slow
@@ -60,16 +63,15 @@ def test_exact_corners_give_exact_poses(options):
 @pytest.mark.parametrize(
     ("options", "largest_deg", "largest_mm"),
     [
-        ({"size_px": 128, "frames": 18, "noise": 0.01}, 0.2, 0.7),
         ({"size_px": 128, "frames": 20, "direction": -1, "jitter_deg": 1.0, "drop": (5,), "blank": (9,)}, 0.2, 0.7),
         ({"size_px": 256, "frames": 12, "blur_px": 0.7, "noise": 0.01}, 0.1, 0.7),
-        ({"size_px": 128, "frames": 24, "side_markers": 4, "disc_markers": 2}, 0.2, 1.0),
+        (FEW_MARKERS, 0.2, 1.0),
     ],
 )
 def test_rendered_session_is_posed(options, largest_deg, largest_mm):
     scene, poses = estimated(**options)
-    blank = set(scene.blanked)
-    np.testing.assert_array_equal(np.flatnonzero(~poses.used), sorted(blank))
+    assert (poses.method, poses.metric) == ("markers", True)  # by themselves
+    np.testing.assert_array_equal(np.flatnonzero(~poses.used), sorted(scene.blanked))
     rotation, position = pose_errors(poses.camera_to_world[poses.used], scene.camera_to_world[poses.used])
     assert rotation < largest_deg
     assert position < largest_mm
@@ -77,6 +79,7 @@ def test_rendered_session_is_posed(options, largest_deg, largest_mm):
     assert (poses.intrinsics.cx, poses.intrinsics.cy) == (scene.size_px / 2, scene.size_px / 2)
     np.testing.assert_allclose(poses.angles_deg[poses.used], scene.angles_deg[poses.used], atol=0.2)
     assert poses.dictionary == "DICT_5X5_50"
+    assert poses.disc_markers == tuple(range(scene.side_markers, scene.side_markers + scene.disc_markers))
     for marker, corners in poses.marker_corners_m.items():
         np.testing.assert_allclose(corners, scene.corners_m[marker], atol=6e-4)
 
@@ -110,7 +113,7 @@ def test_report_is_json_and_says_how_good_the_poses_are(tmp_path):
 
 @pytest.mark.slow
 def test_picture_of_poses_has_axes_where_no_frame_is_left_out(tmp_path):
-    _, poses = estimated(size_px=128, frames=9)
+    _, poses = estimated(**FEW_MARKERS)
     assert poses.used.all()
     draw_poses(poses, pose_report(poses, SessionInfo(), []), tmp_path / "poses.png")
     picture = np.array(Image.open(tmp_path / "poses.png").convert("RGB"))
@@ -146,10 +149,6 @@ def test_frames_without_markers_are_refused_with_names_and_advice():
     noise = list(np.random.default_rng(0).integers(0, 255, (4, 64, 64)).astype(np.uint8))
     with pytest.raises(InputError, match=r"first \.\.\. last.*dictionary"):
         poses_from_markers(noise, ["first", "b", "c", "last"], INFO)
-    scene = MarkerScene(frames=18)
+    scene, other = MarkerScene(frames=3, turn_deg=60.0), replace(INFO, marker_dictionary="DICT_4X4_50")
     with pytest.raises(InputError, match="DICT_4X4_50"):
-        poses_from_markers(
-            scene.render()[:3],
-            scene.names()[:3],
-            SessionInfo(marker_dictionary="DICT_4X4_50", marker_side_m=SIDE_M),
-        )
+        poses_from_markers(scene.render(), scene.names(), other)

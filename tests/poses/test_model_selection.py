@@ -196,9 +196,9 @@ def test_one_displaced_marker_is_no_displaced_frame():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("frames", "which"), [(10, (4,)), (30, (0, 13, 22))])
-def test_a_session_with_displaced_frames_keeps_the_turntable_and_names_them(frames, which):
-    scene = MarkerScene(size_px=128, frames=frames, displaced=which)
+def test_a_session_with_displaced_frames_keeps_the_turntable_and_names_them():
+    which = (0, 13)
+    scene = MarkerScene(size_px=128, frames=20, displaced=which)
     names = scene.names()
     poses = poses_from_markers(scene.render(), names, SessionInfo(marker_side_m=SIDE_M))
     assert poses.model == "turntable"
@@ -312,7 +312,7 @@ def test_hard_session_is_posed(name, size_px, frames, largest_deg, largest_mm):
 @pytest.mark.slow
 def test_a_wobbling_and_distorted_session_is_posed_and_reported():
     effects = ("{wobble: {amplitude_deg: 1}}", "{lens_distortion: {k1: -0.3}}", "{axis_tilt: {tilt_deg: 5}}")
-    posed = pose(Case(effects, any_axis=True), 224, 10)
+    posed = pose(Case(effects, any_axis=True), 176, 10)
     assert posed.poses.model == "free poses"
     assert posed.rotation_deg.max() < 0.1
     assert posed.position_mm.max() < 0.7

@@ -23,6 +23,8 @@ from hsi_sc_nerf.poses.residuals import MarkerResiduals, PointResiduals
 from hsi_sc_nerf.poses.track_adjustment import adjust_together, adjust_tracks
 
 SEEDS = 12
+NAMES = [f"f{i}" for i in range(12)]
+UNMEASURED = {"reprojection_error_px": np.zeros(12), "overall_error_px": 0.0, "markers_per_frame": (3,) * 12}
 
 
 def scores(adjusted, true):
@@ -67,11 +69,10 @@ def test_markers_that_are_shifted_together_are_covered():
 def test_a_scale_by_a_container_whose_markers_may_stand_off_is_stated_as_uncertain():
     true = marker_turntable(MarkerScene(size_px=256, frames=12))
     seen = marker_observations(true)
-    adjusted, names = Adjusted(true, Problem(MarkerResiduals(true, seen, 3.0))), [f"f{i}" for i in range(12)]
-    specific = {"reprojection_error_px": np.zeros(12), "overall_error_px": 0.0, "markers_per_frame": (3,) * 12}
+    adjusted = Adjusted(true, Problem(MarkerResiduals(true, seen, 3.0)))
     for known, source, least in (("marker_side_m", "markers", 0.0), ("container_diameter_m", "container", 0.014)):
         info = SessionInfo(container_height_m=0.07, **{known: 0.03})
-        scale = in_object_frame(adjusted, seen, names, (256, 256), info, **specific).scale
+        scale = in_object_frame(adjusted, seen, NAMES, (256, 256), info, **UNMEASURED).scale
         assert scale.source == source
         assert least <= scale.uncertainty < least + 0.005
 
@@ -83,11 +84,10 @@ def test_markers_on_the_disc_go_before_the_containers_foot(off_m, by_foot):
     """Markers that face up nearer to the lid than to the foot lie on the lid."""
     true = marker_turntable(MarkerScene(size_px=256, frames=12, side_markers=0))
     adjusted = Adjusted(true, Problem(MarkerResiduals(true, marker_observations(true), 3.0)))
-    specific = {"reprojection_error_px": np.zeros(12), "overall_error_px": 0.0, "markers_per_frame": (3,) * 12}
     info, disc_m = SessionInfo(container_diameter_m=0.09, container_height_m=0.07), disc_height(true)
 
     def posed(outline):
-        return in_object_frame(adjusted, None, [f"f{i}" for i in range(12)], (256, 256), info, outline, **specific)
+        return in_object_frame(adjusted, None, NAMES, (256, 256), info, outline, **UNMEASURED)
 
     found, sure = (posed(ContainerOutline(0.045, 0.001, disc_m + off_m, sigma, 0.07)) for sigma in (0.003, 0.0))
     assert found.disc_by_container == by_foot

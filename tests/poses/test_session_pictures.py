@@ -188,7 +188,7 @@ def test_the_best_picture_is_sharp_quiet_and_well_exposed(pear, tmp_path, kinds,
 
 @pytest.fixture(scope="module")
 def machine():
-    scene = MarkerScene(size_px=128, frames=10, noise=0.003)
+    scene = MarkerScene(size_px=128, frames=6, noise=0.003)
     return scene, scene.render()
 
 
@@ -251,6 +251,7 @@ ANGLES_DEG = (0.0, 90.0, 180.0, 270.0)
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("blank_figures")
 def test_the_packed_frames_pictures_are_read_and_reported(tmp_path):
     folder = write_session(tmp_path / "session", ANGLES_DEG)
     session = open_session(folder)
@@ -276,6 +277,7 @@ def test_the_packed_frames_pictures_are_read_and_reported(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("blank_figures")
 def test_pictures_are_not_read_where_nothing_is_measured(tmp_path):
     session = open_session(write_session(tmp_path / "session", ANGLES_DEG))
     blank = [np.zeros((48, 48), np.uint8)] * 4

@@ -61,7 +61,7 @@ def test_exact_tracks_give_the_exact_machine(angles_deg):
 
 def narrow_machine(narrower=4.0):
     """The machine far away, before a longer lens: the images keep their size."""
-    true = machine(np.arange(0, 360, 18.0))
+    true = machine(np.arange(0, 360, 18.0), points=100)
     middle = np.array([0.0, 0.0, np.median(true.points_3d[:, 2])])
     height = np.array([0.0, 0.0, middle[2]])
     points_3d = (true.points_3d - middle) / narrower + height

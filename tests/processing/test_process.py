@@ -1,6 +1,7 @@
 import json
 import logging
 import re
+import shutil
 import sys
 import weakref
 from dataclasses import replace
@@ -51,8 +52,22 @@ def run(session, output, config=None, poses=true_poses):
 
 
 @pytest.fixture
-def session(tmp_path):
+def session(tmp_path, blank_figures):
     return write_session(tmp_path / "session", ANGLES_DEG)
+
+
+@pytest.fixture(scope="module")
+def processed_once(tmp_path_factory):
+    root = tmp_path_factory.mktemp("processed")
+    run(write_session(root / "session", ANGLES_DEG), root / "data")
+    return root
+
+
+@pytest.fixture
+def processed(processed_once, tmp_path, blank_figures):
+    """A session and its dataset, with the files' times."""
+    shutil.copytree(processed_once, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "session", tmp_path / "data"
 
 
 def written(output) -> dict[str, int]:
@@ -109,10 +124,8 @@ def test_a_cube_that_vanishes_is_named_and_leaves_nothing_half_written(session, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("specim", [True, False])
-def test_session_to_dataset(tmp_path, specim):
-    session = write_session(tmp_path / "session", ANGLES_DEG, specim=specim)
-    output = run(session, tmp_path / "data")
+def test_session_to_dataset(processed):
+    _, output = processed
     dataset = open_packed(output)
     assert [frame.capture for frame in dataset.frames] == ["ball_1", "ball_2", "ball_3", "ball_4"]
     assert dataset.intrinsics == INTRINSICS
@@ -169,9 +182,11 @@ def test_a_session_of_finished_reflectance(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("blank_figures")
 def test_the_pose_estimate_gets_what_the_session_tells(tmp_path):
+    """A session in a plain folder."""
     info = {**INFO, "nominal_step_deg": 90, "direction": "ccw", "marker_dictionary": "DICT_4X4_50"}
-    session = write_session(tmp_path / "session", ANGLES_DEG, info=info)
+    session = write_session(tmp_path / "session", ANGLES_DEG, specim=False, info=info)
     got = {}
 
     def poses(images, names, **options):
@@ -191,8 +206,8 @@ def test_the_pose_estimate_gets_what_the_session_tells(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_same_input_is_processed_once_and_other_settings_redo_what_depends_on_them(session, tmp_path):
-    output = run(session, tmp_path / "data")
+def test_the_same_input_is_processed_once_and_other_settings_redo_what_depends_on_them(processed):
+    session, output = processed
     before, stamp = written(output), (output / "transforms.json").stat().st_mtime_ns
     assert run(session, output, poses=no_markers) == output
     assert run(session, output, ProcessConfig(workers=1), poses=no_markers) == output
@@ -205,25 +220,24 @@ def test_the_same_input_is_processed_once_and_other_settings_redo_what_depends_o
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["panel", "camera"])
-def test_a_changed_file_that_the_session_or_a_setting_names_is_noticed(session, tmp_path, kind):
-    if kind == "panel":
-        named = session / "panel.csv"
-        named.write_text("400,1.0\n1000,1.0\n")
-        (session / "session.json").write_text(json.dumps({**INFO, "panel_reflectance": "panel.csv"}))
-        config = ProcessConfig()
-    else:
-        named = run(session, tmp_path / "earlier") / "transforms.json"
-        config = ProcessConfig(camera=named.parent)
-    output = run(session, tmp_path / "data", config)
-    named.write_text(named.read_text().replace("1.0\n", "0.9\n") + "\n")
+def test_a_changed_panel_is_noticed(session, tmp_path):
+    (session / "session.json").write_text(json.dumps({**INFO, "panel_reflectance": "panel.csv"}))
+    for white in (1.0, 0.9):
+        (session / "panel.csv").write_text(f"400,{white}\n1000,{white}\n")
+        cube = open_packed(run(session, tmp_path / "data")).frames[0].cube()
+        np.testing.assert_allclose(cube / REFLECTANCE_SCALE, white * frame_reflectance(0.0), atol=1e-3)
+
+
+@pytest.mark.slow
+def test_a_changed_earlier_camera_is_noticed(processed, tmp_path):
+    session, earlier = processed
+    config = ProcessConfig(camera=earlier)
+    output = run(session, tmp_path / "other", config)
+    assert run(session, output, config, poses=no_markers) == output
+    transforms = earlier / "transforms.json"
+    transforms.write_text(transforms.read_text() + "\n")
     with pytest.raises(InputError, match="no marker was found"):
         run(session, output, config, poses=no_markers)
-    run(session, output, config)
-    white = 0.9 if kind == "panel" else 1.0
-    np.testing.assert_allclose(
-        open_packed(output).frames[0].cube() / REFLECTANCE_SCALE, white * frame_reflectance(0.0), atol=1e-3
-    )
 
 
 @pytest.mark.parametrize(
@@ -240,6 +254,7 @@ def test_an_earlier_session_tells_how_the_table_turns(angles_deg, direction):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("blank_figures")
 def test_a_camera_of_a_session_without_a_scale_gives_none(tmp_path):
     info = {"object": "ball", "nominal_step_deg": 90, "direction": "ccw"}
     session = write_session(tmp_path / "session", ANGLES_DEG, info=info)
@@ -271,8 +286,8 @@ def test_a_changed_capture_is_done_again_alone_and_an_outdated_dataset_does_not_
 
 
 @pytest.mark.slow
-def test_damaged_output_is_made_again(session, tmp_path):
-    output = run(session, tmp_path / "data")
+def test_damaged_output_is_made_again(processed):
+    session, output = processed
     before = written(output)
     data = output / "cubes" / "ball_2.bip"
     data.write_bytes(data.read_bytes()[:-2])
@@ -308,6 +323,7 @@ def test_frames_without_a_pose_are_left_out_with_a_warning(session, tmp_path, ca
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("blank_figures")
 def test_a_frame_in_which_nothing_was_found_is_named(tmp_path, caplog):
     angles_deg = tuple(np.arange(20) * 18.0)
     session = write_session(tmp_path / "session", angles_deg)
@@ -322,6 +338,7 @@ def test_a_frame_in_which_nothing_was_found_is_named(tmp_path, caplog):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("blank_figures")
 def test_names_are_printed_as_they_are(tmp_path, capsys):
     info = {**INFO, "white_reference": "[white]"}
     session = write_session(tmp_path / "[session]", ANGLES_DEG, info=info)
@@ -359,6 +376,7 @@ def test_another_dataset_is_not_overwritten(session, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("blank_figures")
 def test_an_object_wider_than_its_container_is_not_cut_off(tmp_path):
     session = write_session(tmp_path / "session", ANGLES_DEG, info={**INFO, "container_diameter_m": 0.05})
     narrow = ProcessConfig(masks=MaskConfig(overhang=1.2))

@@ -18,8 +18,8 @@ RAYS = 72  # a multiple of the bands
 REPEATS = 4
 
 
-def small(name, **changes):
-    scene = override(load_scene(name), size_px=24, bands=6, effects=(), **changes)
+def small(name, size_px=24):
+    scene = override(load_scene(name), size_px=size_px, bands=6, effects=())
     return dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, supersampling=16))
 
 
@@ -49,10 +49,10 @@ def test_shading_and_one_bounce_agree():
 
 @pytest.mark.slow
 def test_unseen_chamber_has_its_own_spectrum_in_even_light_and_is_the_lamp_otherwise():
-    scene = small("sphere")
+    scene = small("sphere", size_px=8)
     level = mitsuba_agreement.render_ours(scene, 0).radiance[0, 0]
     for transport, expected in (("even", level), ("chamber", np.ones(6))):
-        corner = mitsuba_rendering.render(scene, 0, transport, rays_per_pixel=RAYS)[:3, :3]
+        corner = mitsuba_rendering.render(scene, 0, transport, rays_per_pixel=RAYS)[:1, :1]
         np.testing.assert_allclose(corner.mean(axis=(0, 1)), expected, atol=1e-3)
 
 

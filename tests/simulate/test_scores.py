@@ -20,20 +20,15 @@ def dataset_and_truth(tiny_dataset):
     return replace(dataset, frames=tuple(frames), intrinsics=truth.intrinsics), truth
 
 
-def with_pose(dataset, index, pose):
-    frames = list(dataset.frames)
-    frames[index] = replace(frames[index], camera_to_world=pose)
-    return replace(dataset, frames=tuple(frames))
-
-
 def test_the_worst_frame_and_the_focal_length_count(dataset_and_truth):
     dataset, truth = dataset_and_truth
     c, s = np.cos(np.radians(0.3)), np.sin(np.radians(0.3))
-    turned = dataset.frames[3].camera_to_world.copy()
+    frames, turned = list(dataset.frames), dataset.frames[3].camera_to_world.copy()
     turned[:3, :3] = turned[:3, :3] @ [[c, -s, 0], [s, c, 0], [0, 0, 1]]
     turned[:3, 3] += [0.0, 0.003, 0.004]
+    frames[3] = replace(frames[3], camera_to_world=turned)
     longer = replace(dataset.intrinsics, fl_x=1.02 * dataset.intrinsics.fl_x)
-    score = score_processing(replace(with_pose(dataset, 3, turned), intrinsics=longer), truth)
+    score = score_processing(replace(dataset, frames=tuple(frames), intrinsics=longer), truth)
     assert score.focal_length_percent == pytest.approx(2.0)
     assert score.rotation_deg == pytest.approx(0.3, rel=1e-4)
     assert score.position_m == pytest.approx(0.005)

@@ -17,7 +17,8 @@ def soft(distance_fn, surface_density, folding=FOLDING):
 def touching_density(radius, folding=FOLDING):
     """Density at the surface of a round body at which a ray that touches it collects half an opacity.
 
-    Along the ray the distance to the body is t^2 / 2 R, so the optical depth is a Gaussian's integral.
+    Along the ray the distance to the body is t^2 / 2 R, so the optical depth is a Gaussian's integral. No opacity
+    from the front tells where the surface is: it would be three times as large on a ball of 0.03 as on one of 0.25.
     """
     return math.log(2.0) / math.sqrt(2.0 * math.pi * radius * folding)
 
@@ -55,11 +56,6 @@ def test_opaque_rises_are_counted(rise_length):
     points, normals = around(radius)
     moved = move_to_silhouettes(density_fn, points, normals, rise_length=rise_length)
     torch.testing.assert_close(moved.norm(dim=-1), torch.full((len(points),), radius), atol=1e-3, rtol=0)
-
-
-def test_the_opacity_from_the_front_would_depend_on_the_radius():
-    """Why there is no such threshold: it would be three times as large on the small ball as on the large one."""
-    assert touching_density(0.03) / touching_density(0.25) == pytest.approx(2.9, abs=0.1)
 
 
 def test_a_stem_is_found_by_the_rays_across_it():

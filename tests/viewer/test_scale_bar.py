@@ -48,11 +48,6 @@ def test_the_bar_is_as_long_in_the_picture_as_its_length_at_the_objects_centre(d
     assert 0.2 <= (end - start)[0] / min(1.0, aspect) <= 0.5
 
 
-def test_nearer_bars_are_shorter():
-    lengths_m = [scale_bar(camera_at(distance_m), CENTRE, UNITS_PER_M)[0] for distance_m in (0.9, 0.45, 0.1)]
-    assert lengths_m == [0.1, 0.05, 0.01]
-
-
 class Browser:
     """What a browser shows of the bar."""
 

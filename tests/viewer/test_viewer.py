@@ -141,7 +141,7 @@ def test_a_formula_without_ends_keeps_the_colours_of_its_first_picture_of_the_ob
     assert panel.legend.gui_handle.content == told
 
 
-@pytest.mark.parametrize("text", ["R970 /", "own = __import__('os')", "own = R1240", "<b>", "{own}", "own = R970**"])
+@pytest.mark.parametrize("text", ["own = R1240", "<b>", "{own}", "own = R970**"])
 def test_a_wrong_formula_is_answered_by_a_sentence_and_the_list_stays(attached, index_of, spectral, text):
     panel = attached[0]
     before = type_in(panel, "")

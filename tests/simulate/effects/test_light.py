@@ -53,11 +53,15 @@ def if_white(light, colours):
     return light @ colour_spectra(colours, np.ones((9, 2)))
 
 
-def light_below(lighting, points, camera_to_world=None):
-    """Light of the highest points at some (x, y), as weights by colour."""
+def highest(renderer, points):
+    """The highest points at some (x, y)."""
     origins = np.column_stack([points, np.full(len(points), 0.5)]).astype(np.float32)
-    hits = lighting._renderer.cast(origins, np.broadcast_to(DOWN, origins.shape).astype(np.float32), 1)
-    weights, colours = lighting.light(hits, np.eye(4) if camera_to_world is None else camera_to_world)
+    return renderer.cast(origins, np.broadcast_to(DOWN, origins.shape).astype(np.float32), 1)
+
+
+def light_below(lighting, points):
+    """Light of the highest points at some (x, y), as weights by colour."""
+    weights, colours = lighting.light(highest(lighting._renderer, points), np.eye(4))
     return dict(zip(colours, weights.T, strict=True))
 
 
@@ -84,9 +88,7 @@ def test_reflections_sum_the_series_of_form_factors(still_life, bounces):
     for _ in range(bounces):
         arriving = factors @ arriving
         expected = expected + arriving
-    points = np.array([[0.07, 0.0], [0.0, -0.08], [0.02, 0.02]])
-    origins = np.column_stack([points, np.full(len(points), 0.5)]).astype(np.float32)
-    hits = still_life.cast(origins, np.broadcast_to(DOWN, origins.shape).astype(np.float32), 1)
+    hits = highest(still_life, np.array([[0.07, 0.0], [0.0, -0.08], [0.02, 0.02]]))
     seen = if_white(*lighting.light(hits, camera))[:, 0]
     direct = Lighting(still_life, [ChamberShading(16), Lamp(0.5)])
     seen -= if_white(*direct.light(hits, camera))[:, 0]
@@ -103,8 +105,10 @@ def test_white_furnace(still_life):
     renderer = Renderer([part(ball(), "white", True)])
     seen = if_white(*picture(renderer, [ChamberShading(), InterReflection(), Gloss()]))
     np.testing.assert_allclose(seen, 1.0, atol=2e-6)
-    # Neighbours that are evenly lit and as white as the chamber cannot be seen either.
-    np.testing.assert_allclose(if_white(*picture(still_life, [InterReflection(16)])), 1.0, atol=2e-3)
+    # Neighbours that are evenly lit and as white as the chamber cannot be seen either. A coat mirrors what it keeps
+    # from the body, of the chamber or of the other parts.
+    for effects in ([InterReflection(16)], [InterReflection(16), Gloss()]):
+        np.testing.assert_allclose(if_white(*picture(still_life, effects)), 1.0, atol=2e-3)
 
 
 ALL = (ChamberShading(16), InterReflection(16), Lamp(), Gloss(roughness=1.0))
@@ -171,13 +175,6 @@ def wall_and_floor(height_m=0.1):
     return surface, points[8:14], points[21:], hidden
 
 
-def test_wall_hides_its_form_factor_of_the_sky():
-    surface, on_floor, _, hidden = wall_and_floor()
-    free = surface.surroundings(2048).chamber_visibility[on_floor]
-    np.testing.assert_allclose(free, 1.0 - hidden, atol=5e-3)
-    assert free[0] == pytest.approx(0.5, abs=0.015)
-
-
 @pytest.mark.parametrize("is_shaded", [False, True])
 def test_bounce_has_the_form_factor_and_both_colours(is_shaded):
     surface, on_floor, on_wall, hidden = wall_and_floor()
@@ -200,9 +197,9 @@ def test_bounce_has_the_form_factor_and_both_colours(is_shaded):
 def test_contact_shadow_of_a_drum_on_a_disc_as_by_brute_force():
     radius_m, height_m = 0.045, 0.07
     drum = part(cylinder(2 * radius_m, height_m, 128, spacing_m=0.0025), "drum")
-    disc = part(cylinder(0.2, 0.006, 128, spacing_m=0.0025).moved(np.array([0.0, 0.0, -0.0063])), "disc")
+    disc = part(cylinder(0.175, 0.006, 128, spacing_m=0.0025).moved(np.array([0.0, 0.0, -0.0063])), "disc")
     distance_m = np.array([0.0003, 0.001, 0.0022, 0.005, 0.01, 0.02, 0.04])
-    lighting = Lighting(Renderer([drum, disc]), [ChamberShading(512)])
+    lighting = Lighting(Renderer([drum, disc]), [ChamberShading(256)])
     # The mean over azimuths is free of most of the chance in single points.
     azimuth = np.linspace(0.0, 2 * np.pi, 90, endpoint=False)
     around = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
@@ -298,11 +295,6 @@ def test_gloss_mirrors_the_chamber_and_what_hides_it(still_life):
     assert of_object[1] < 1 - at_normal
     assert of_support[1] == pytest.approx(1.0 - of_object[1], abs=1e-6)
     assert (of_support[2], chamber[2]) == (1.0, 0.0)
-
-
-def test_in_a_white_furnace_glossy_neighbours_cannot_be_seen(still_life):
-    """What the coat keeps from the body it mirrors, of the chamber or of the other parts."""
-    np.testing.assert_allclose(if_white(*picture(still_life, [InterReflection(16), Gloss()])), 1.0, atol=2e-3)
 
 
 # Two effects together are what their definitions say

@@ -142,9 +142,6 @@ def test_the_poses_are_those_of_a_room_in_which_the_object_moves():
     "names",
     [
         [],
-        ["{axis_tilt: {tilt_deg: 15}}"],
-        ["{wobble: {amplitude_deg: 3}}"],
-        ["{off_centre: {shift_m: 0.01}}"],
         ["{lens_distortion: {k1: -0.9, k2: 0.5, p1: 0.01, p2: -0.015}}"],
         MOVED,
     ],
