@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from operator import attrgetter
 from typing import Any, Literal
 
+import yaml
+
 Preset = Literal["fast", "balanced", "best"]
 
 Device = Literal["cpu", "cuda"]
@@ -13,30 +15,37 @@ Device = Literal["cpu", "cuda"]
 ITERATIONS = "max_num_iterations"
 RAYS = "pipeline.datamanager.train_num_rays_per_batch"
 
-PRESETS: Mapping[Device, Mapping[Preset, Mapping[str, int]]] = {
+
+class PresetValue(int):
+    """A number of a preset, which another preset may replace. A number that the user gives is a plain ``int``."""
+
+
+yaml.Dumper.add_representer(PresetValue, lambda dumper, value: dumper.represent_int(int(value)))
+
+_P = PresetValue
+PRESETS: Mapping[Device, Mapping[Preset, Mapping[str, PresetValue]]] = {
     "cpu": {
-        "fast": {ITERATIONS: 800, RAYS: 1024},
-        "balanced": {ITERATIONS: 2400, RAYS: 1024},
-        "best": {ITERATIONS: 4000, RAYS: 1024},
+        "fast": {ITERATIONS: _P(800), RAYS: _P(1024)},
+        "balanced": {ITERATIONS: _P(2400), RAYS: _P(1024)},
+        "best": {ITERATIONS: _P(4000), RAYS: _P(1024)},
     },
     "cuda": {
-        "fast": {ITERATIONS: 1000, RAYS: 2048},
-        "balanced": {ITERATIONS: 5000, RAYS: 2048},
-        "best": {ITERATIONS: 40_000, RAYS: 2048},
+        "fast": {ITERATIONS: _P(1000), RAYS: _P(2048)},
+        "balanced": {ITERATIONS: _P(5000), RAYS: _P(2048)},
+        "best": {ITERATIONS: _P(40_000), RAYS: _P(2048)},
     },
 }
 """Settings by device and preset, as attributes of the trainer's configuration."""
 
 
 def apply_preset(config: Any) -> None:
-    """Set what the configuration's preset sets for its device, but for settings that the user has changed.
+    """Set what the configuration's preset sets for its device, but for settings that the user has given.
 
     Args:
-        config: of the trainer; changed in place, unless its preset is None. A setting is the user's where it is not
-            that of balanced, the default.
+        config: of the trainer; changed in place, unless its preset is None. Settings that are no `PresetValue` stay.
 
     Example:
-        >>> config.preset, config.max_num_iterations = "fast", PRESETS["cpu"]["balanced"][ITERATIONS]
+        >>> config.preset = "fast"
         >>> apply_preset(config)
         >>> config.max_num_iterations
         800
@@ -44,11 +53,10 @@ def apply_preset(config: Any) -> None:
     if config.preset is None:
         return
     device: Device = "cuda" if config.machine.device_type == "cuda" else "cpu"
-    untouched = PRESETS[default_device()]["balanced"]
     for path, value in PRESETS[device][config.preset].items():
         parent, _, name = path.rpartition(".")
         part = attrgetter(parent)(config) if parent else config
-        if getattr(part, name) == untouched[path]:
+        if isinstance(getattr(part, name), PresetValue):
             setattr(part, name, value)
 
 

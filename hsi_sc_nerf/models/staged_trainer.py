@@ -70,7 +70,7 @@ class StagedTrainerConfig(TrainerConfig):
     masked: StageConfig = field(default_factory=masked_stage)
     """Second stage: the masked object, and some background rays."""
     preset: Preset | None = None
-    """fast, balanced or best: iterations and rays a step. Your own go before it, but for those of balanced."""
+    """fast, balanced or best: iterations and rays a step. Your own go before it."""
     max_train_seconds: float | None = between(0.001, math.inf, default=None)
     """End the run after so many seconds of training instead of --max-num-iterations; stages and learning rates follow
     the clock. Evaluations and saving do not count. Two such runs do not have the same weights bit by bit."""

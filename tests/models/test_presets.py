@@ -3,6 +3,7 @@
 import copy
 
 import pytest
+import yaml
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.benchmark.configurations import training_config
@@ -24,7 +25,9 @@ def test_a_preset_is_that_of_the_device(device, preset):
 def test_an_option_goes_before_the_preset():
     fast = PRESETS["cpu"]["fast"]
     words = ("--preset", "fast", "--machine.device-type", "cpu")
-    assert of((*words, "--max-num-iterations", "123")) == (123, fast[RAYS])
+    balanced = PRESETS["cpu"]["balanced"][ITERATIONS]
+    for iterations in (123, balanced):
+        assert of((*words, "--max-num-iterations", str(iterations))) == (iterations, fast[RAYS])
     assert of((*words, "--pipeline.datamanager.train-num-rays-per-batch", "77")) == (fast[ITERATIONS], 77)
 
 
@@ -37,6 +40,12 @@ def test_balanced_is_the_default_and_applied_twice_is_applied_once():
     once = config.max_num_iterations
     apply_preset(config)
     assert config.max_num_iterations == once
+
+
+def test_a_preset_is_written_as_plain_numbers():
+    words = ("--preset", "fast", "--machine.device-type", "cpu")
+    written = yaml.dump({"iterations": training_config("hsi-sc-nerf", words).max_num_iterations})
+    assert yaml.safe_load(written) == {"iterations": 800}
 
 
 def test_better_presets_take_longer():
