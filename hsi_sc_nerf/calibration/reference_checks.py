@@ -185,9 +185,11 @@ def light_over_white(dark: Float[np.ndarray, "bands"], white: Float[np.ndarray, 
     The dark spectrum is fitted by a level and the white's spectrum. Both are raw counts: the white's own dark, which
     may be wrong as well, is part of the level.
     """
+    if len(white) < 4:
+        return 0.0
     centred = white - white.mean()
     information = float(centred @ centred)
-    if not information > 0.0 or len(white) < 4:
+    if not information > 0.0:
         return 0.0
     slope = float(centred @ dark) / information
     rest = dark - dark.mean() - slope * centred
