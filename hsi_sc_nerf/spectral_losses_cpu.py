@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from jaxtyping import Float32
+
+from hsi_sc_nerf.compiled import compiled
 
 _LARGEST = float(np.finfo(np.float32).max)
 
 # Sums in any order, which the processor computes several elements at a time.
-_compiled = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
+_compiled = compiled(fastmath={"reassoc", "contract"})
 
 
 def angles(a: Float32[np.ndarray, "n bands"], b: Float32[np.ndarray, "n bands"]) -> Float32[np.ndarray, "n"]:

@@ -171,3 +171,18 @@ def test_held_pixels_equal_those_read_from_files(flagged_dataset, device):
     indices = torch.from_numpy(sampler.draw(3, 0.5, 0.5)[0]).to(device)
     for name, value in held(indices).items():
         np.testing.assert_array_equal(value.cpu().numpy(), read[name])
+
+
+def test_pixels_of_either_byte_order_are_the_same():
+    counts = np.arange(24, dtype=np.uint16).reshape(2, 3, 4)
+    indices = torch.tensor([[0, 1, 2]])
+    found = [
+        DevicePixels(
+            [SimpleNamespace(cube=lambda kind=kind: counts.astype(kind))],
+            np.ones((1, 2, 3), bool),
+            "cpu",
+            has_flagged=False,
+        )
+        for kind in ("<u2", ">u2")
+    ]
+    torch.testing.assert_close(*(pixels(indices)["spectral"] for pixels in found))

@@ -255,7 +255,7 @@ def _read_table(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
         ValueError: it is no table, or has two intercepts.
     """
     table = read_number_table(path, blanks=_INTERCEPTS)
-    head, columns = keyed(table.notes), table.by_title()
+    head, columns = {key: value for key, value in keyed(table.notes).items() if value}, table.by_title()
     for title in _COEFFICIENTS:
         if title in columns and "coefficient" not in columns:
             columns["coefficient"] = columns.pop(title)
@@ -274,6 +274,8 @@ def _domain(head: dict[str, str], columns: dict[str, np.ndarray]) -> Domain | No
         ValueError: the table lacks what the limit needs.
     """
     limits = [number_in(head.get(key, "inf")) for key in ("t2_limit", "q_limit")]
+    if any(map(math.isnan, limits)):
+        raise ValueError("t2_limit and q_limit must be numbers")
     if not (limits[0] < math.inf or limits[1] < math.inf):
         return None
     weights, loadings = (

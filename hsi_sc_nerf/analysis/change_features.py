@@ -75,11 +75,17 @@ def surface_samples(
 def surface_gradients(
     points: Float[np.ndarray, "n 3"], values: Float[np.ndarray, "n f"]
 ) -> Float[np.ndarray, "n f 3"]:
-    """Gradient of each value along the surface, by least squares over the nearest points."""
-    near = cKDTree(points).query(points, k=min(_NEIGHBOURS, len(points)))[1]
+    """Gradient of each value along the surface, by least squares over the nearest points that have all values.
+
+    NaN at points that do not.
+    """
+    known, gradients = np.isfinite(values).all(axis=1), np.full((*values.shape, 3), np.nan)
+    points, values = points[known], values[known]
+    near = cKDTree(points).query(points, k=np.arange(1, min(_NEIGHBOURS, len(points)) + 1))[1]
     # Across the surface, neighbours hardly differ: small singular values are left out.
     inverse = np.linalg.pinv(points[near[:, 1:]] - points[:, None], rcond=0.2)
-    return np.einsum("njk,nkf->nfj", inverse, values[near[:, 1:]] - values[:, None])
+    gradients[known] = np.einsum("njk,nkf->nfj", inverse, values[near[:, 1:]] - values[:, None])
+    return gradients
 
 
 def _thinned(cloud: SpectralCloud, features: Float[np.ndarray, "n f"], spacing_m: float) -> SurfaceSample:

@@ -125,7 +125,8 @@ def changes(
     modes = session_sd * np.stack([np.ones(len(one.wavelengths_nm)), np.linspace(-1.0, 1.0, len(one.wavelengths_nm))])
     typical = np.median(one.spectra[seen], axis=0)[None]
     usual, *moved = (
-        _scalars(x, one.wavelengths_nm, bands_nm, indices) for x in (typical, *(typical * (1.0 + m) for m in modes))
+        _scalars(one.spectra[seen] * factor, one.wavelengths_nm, bands_nm, indices)
+        for factor in (1.0, *(1.0 + modes))
     )
     quantities = (len(one.wavelengths_nm) > 1) + len(usual) + 1  # spectrum, scalars, surface
     limit_m2 = limit_of_blank_m2(float(one.areas_m2[seen].sum())) if repeat is None else 0.0
@@ -164,9 +165,10 @@ def changes(
     for name in usual:
         values = [each[name][:, None] for each in measured]
         # An index of hardly any light is not defined.
-        known = [np.isfinite(patches.means(each - values[0], one.areas_m2)).sum() for each in values[1:]]
-        if min(known) >= _LEAST_PATCHES:
-            shared = np.linalg.norm([each[name] - usual[name] for each in moved], axis=0)
+        since = [patches.means(each - values[0], one.areas_m2) for each in values[1:]]
+        if np.isfinite(since).all(axis=0).sum() >= _LEAST_PATCHES:
+            # The typical spectrum itself may be one that the index is not defined of.
+            shared = np.linalg.norm([[np.nanmedian(each[name] - usual[name])] for each in moved], axis=0)
             found[name] = tested(name, "1", values, shared)
     found[SURFACE] = tested(SURFACE, "mm", [1e3 * day.raised_m[:, None] for day in days], np.zeros(1))
     return found

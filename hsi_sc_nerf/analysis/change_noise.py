@@ -129,9 +129,10 @@ def correlation(ratio: Float[np.ndarray, "n k"], centres_m: Float[np.ndarray, "n
     count = np.bincount(each, minlength=_BINS + 2)
     mean = np.bincount(each, product.ravel(), _BINS + 2) / np.maximum(count, 1)
     # Bin 0 holds each patch with itself; bin b the pairs about b patches apart.
-    at, value = np.arange(_BINS + 1) * PATCH_M, np.concatenate([[1.0], mean[1 : _BINS + 1]])
-    below = np.flatnonzero((value < np.exp(-1.0)) & (count[: _BINS + 1] > 0))
-    last = int(below[0]) if len(below) else _BINS
+    filled = np.flatnonzero(count[: _BINS + 1])
+    at, value = filled * PATCH_M, np.concatenate([[1.0], mean[filled[1:]]])
+    below = np.flatnonzero(value < np.exp(-1.0))
+    last = int(below[0]) if len(below) else len(at) - 1
     high, low = value[last - 1], min(value[last], np.exp(-1.0))
-    length_m = float(at[last - 1] + PATCH_M * (high - np.exp(-1.0)) / max(high - low, 1e-12))
+    length_m = float(at[last - 1] + (at[last] - at[last - 1]) * (high - np.exp(-1.0)) / max(high - low, 1e-12))
     return length_m, float(len(ratio) ** 2 / np.exp(-distance_m / max(length_m, 1e-9)).sum())

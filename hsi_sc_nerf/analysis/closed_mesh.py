@@ -18,6 +18,8 @@ from hsi_sc_nerf.settings_file import between
 _THINNING = 3.0
 # Largest number of thinning cells along the cloud's longest side, for the sake of memory.
 _MOST_CUBES = 5000
+# Largest number of cells that an index holds.
+_MOST_CELLS = 2.0**62
 # Fraction of the triangles below which a connected piece is a speck.
 _SMALLEST_PIECE = 0.001
 NEIGHBOURS = 48
@@ -149,7 +151,16 @@ def open_edges(mesh: Mesh) -> int:
 def thinned(
     points_m: Float[np.ndarray, "n 3"], columns: Float[np.ndarray, "n k"], cell_m: float
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m k"]]:
-    """Voxel downsampling: mean position and mean columns, such as a normal, of the points in each cell."""
+    """Voxel downsampling: mean position and mean columns, such as a normal, of the points in each cell.
+
+    Raises:
+        InputError: points are not finite, or so far apart that their cells cannot be numbered.
+    """
+    if not np.prod(np.ptp(points_m, axis=0) / cell_m + 2.0, dtype=float) < _MOST_CELLS:
+        raise InputError(
+            "the cloud has points that are not finite or kilometres apart; is it in metres? Scale it to metres, and "
+            "take away such points."
+        )
     cells = np.floor((points_m - points_m.min(axis=0)) / cell_m).astype(np.int64)
     shape = cells.max(axis=0) + 1
     _, cell = np.unique(np.ravel_multi_index(tuple(cells.T), tuple(shape)), return_inverse=True)

@@ -113,7 +113,9 @@ def find_defects(
     dead = elements_without_response(images)
     for readings in (white, *frames):
         dead |= readings.without_dark()
-    bad = unlit_bands(np.where(dead, np.nan, white_light))
+    brightness = np.where(dead, 0.0, white_light).sum(axis=1)
+    bright = brightness >= BRIGHT * np.percentile(brightness, 99.0)  # a white may fill less than half of its lines
+    bad = unlit_bands(np.where(dead, np.nan, white_light)[bright])
     bad |= dead.mean(axis=0) > DEAD_BAND_FRACTION
     if good_bands is not None:
         bad |= ~good_bands

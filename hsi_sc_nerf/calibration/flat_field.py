@@ -74,7 +74,7 @@ def relative_brightness(
     """Counts above dark over the white spectrum, both summed over the elements in ``use``; 0 without any."""
     used = use.astype(np.float64)
     dark_sum, white_sum = (used * dark).sum(axis=1), used @ spectrum
-    light = np.stack([np.einsum("xb,xb->x", np.asarray(line, np.float64), used) for line in counts])
+    light = np.stack([np.where(use, line, 0.0).sum(axis=1) for line in counts])
     return np.where(white_sum > 0.0, (light - dark_sum) / np.where(white_sum > 0.0, white_sum, 1.0), 0.0)
 
 

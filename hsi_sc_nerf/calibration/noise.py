@@ -73,12 +73,22 @@ def measure_noise(
         dead: dead detector elements.
     """
     bands = white.shape[2]
-    rounding = np.full(bands, np.sqrt(QUANTISATION_VARIANCE))
-    measured = None if dark is None else read_noise(dark, None if dark.shape[1] != white.shape[1] else dead)
+    rounding_variance = _rounding_variance(white)
+    rounding = np.full(bands, np.sqrt(rounding_variance))
+    of_dark = None if dark is None or dark.shape[1] != white.shape[1] else dead
+    measured = None if dark is None else read_noise(dark, of_dark, rounding_variance)
     level = dark_columns(dark, *white.shape[1:])
     # Without the dark level, the white's counts do not tell how many of them are photons.
     known = rounding if dark is None else measured
-    transfer = photon_transfer(white, region, level, known, saturation_counts=saturation_counts, dead=dead)
+    transfer = photon_transfer(
+        white,
+        region,
+        level,
+        known,
+        saturation_counts=saturation_counts,
+        dead=dead,
+        rounding_variance=rounding_variance,
+    )
     if transfer is None:
         slope = None
     else:
@@ -87,6 +97,15 @@ def measure_noise(
             measured = np.full(bands, of_white)
     deviation = rounding if measured is None else np.maximum(measured, rounding)
     return NoiseModel(deviation, slope or 0.0, measured is not None, slope is not None)
+
+
+def _rounding_variance(white: Num[np.ndarray, "lines samples bands"]) -> float:
+    """Variance of rounding to whole counts, or of numbers with a fraction, counts^2."""
+    some = white[:: -(-len(white) // MAX_TRIPLES)]
+    some = some[np.isfinite(some)]
+    if white.dtype.kind != "f" or np.array_equal(some, np.rint(some)):
+        return QUANTISATION_VARIANCE
+    return QUANTISATION_VARIANCE * float(np.spacing(np.abs(some).max())) ** 2
 
 
 def reflectance_uncertainty(
@@ -131,7 +150,9 @@ def reflectance_uncertainty(
 
 
 def read_noise(
-    dark: Num[np.ndarray, "dark_lines columns bands"], dead: Bool[np.ndarray, "columns bands"] | None = None
+    dark: Num[np.ndarray, "dark_lines columns bands"],
+    dead: Bool[np.ndarray, "columns bands"] | None = None,
+    rounding_variance: float = QUANTISATION_VARIANCE,
 ) -> Float[np.ndarray, "bands"] | None:
     """Standard deviation of a reading without light in each band, counts.
 
@@ -149,10 +170,10 @@ def read_noise(
     if not np.nansum(variance) > 0.0:
         return None
     degrees = lines - 1
-    middle = np.maximum(np.nanmedian(variance, axis=0), QUANTISATION_VARIANCE) / stats.chi2.median(degrees)
+    middle = np.maximum(np.nanmedian(variance, axis=0), rounding_variance) / stats.chi2.median(degrees)
     low, high = (middle * stats.chi2.ppf(p, degrees) for p in (OUTLIER_PROBABILITY, 1.0 - OUTLIER_PROBABILITY))
     # Below the variance of rounding, an element is quiet if its level happens to lie between two counts.
-    usual = (variance <= high) & ((variance >= low) | (low <= QUANTISATION_VARIANCE))
+    usual = (variance <= high) & ((variance >= low) | (low <= rounding_variance))
     return np.sqrt(np.where(usual, variance, 0.0).sum(axis=0) / np.maximum(usual.sum(axis=0), 1))
 
 
@@ -164,6 +185,7 @@ def photon_transfer(
     *,
     saturation_counts: float | None = None,
     dead: Bool[np.ndarray, "samples bands"] | None = None,
+    rounding_variance: float = QUANTISATION_VARIANCE,
 ) -> tuple[float, float | None] | None:
     """Slope of the photon transfer curve, counts per electron, from the white; the read noise if it is not known.
 
@@ -198,11 +220,11 @@ def photon_transfer(
     if not pixel_signal.any():
         return None
     fraction = signal / np.where(pixel_signal > 0.0, pixel_signal, 1.0)
-    difference *= readable
+    difference = np.where(readable, difference, np.float32(0.0))
     difference -= difference.sum(axis=2, keepdims=True) * fraction.astype(np.float32)
     squared = np.square(difference, out=difference)
     squared /= 6.0
-    kept = inside & _inliers(squared, inside, readable)
+    kept = inside & _inliers(squared, inside, readable, rounding_variance)
     # Expected squares after the projection: per_slope * slope + of_read.
     read_variance = readable * (1.0 if read_noise is None else read_noise**2)
     per_slope = signal * (1.0 - fraction)
@@ -215,11 +237,13 @@ def photon_transfer(
         # The projection leaves nothing of a single band.
         return None
     if read_noise is None:
-        (slope, variance), (_, error) = _fit_variances(np.stack([x, offset], axis=1), y, 0.0 * y, readings[used])
-        if error <= MAX_VARIANCE_ERROR * (max(variance, QUANTISATION_VARIANCE) + slope * DIM * x.min()):
+        (slope, variance), (_, error) = _fit_variances(
+            np.stack([x, offset], axis=1), y, 0.0 * y, readings[used], rounding_variance
+        )
+        if error <= MAX_VARIANCE_ERROR * (max(variance, rounding_variance) + slope * DIM * x.min()):
             return float(slope), float(np.sqrt(variance))
-        offset = QUANTISATION_VARIANCE * offset
-    (slope,), _ = _fit_variances(x[:, None], y, offset, readings[used])
+        offset = rounding_variance * offset
+    (slope,), _ = _fit_variances(x[:, None], y, offset, readings[used], rounding_variance)
     return float(slope), None
 
 
@@ -228,13 +252,17 @@ def _fit_variances(
     measured: Float[np.ndarray, "n"],
     offset: Float[np.ndarray, "n"],
     readings: Float[np.ndarray, "n"],
+    least: float,
 ) -> tuple[Float[np.ndarray, "k"], Float[np.ndarray, "k"]]:
-    """Weighted least squares ``measured = offset + design @ x`` with x >= 0; x and its standard errors."""
+    """Weighted least squares ``measured = offset + design @ x`` with x >= 0; x and its standard errors.
+
+    Variances below ``least`` weigh as it does.
+    """
     found = np.zeros(design.shape[1])
     scale = np.abs(design).max(axis=0).clip(min=1e-300)
     for _ in range(5):
         # The error of a variance is proportional to it, so the weights depend on what is fitted.
-        weight = np.sqrt(readings) / np.maximum(offset + design @ found, QUANTISATION_VARIANCE)
+        weight = np.sqrt(readings) / np.maximum(offset + design @ found, least)
         weighted = weight[:, None] * design / scale
         found = nnls(weighted, weight * (measured - offset))[0] / scale
     # Variance of a squared deviation: twice the square of its mean.
@@ -245,11 +273,12 @@ def _inliers(
     squared: Float[np.ndarray, "triples samples bands"],
     inside: Bool[np.ndarray, "triples samples"],
     readable: Bool[np.ndarray, "samples bands"],
+    least: float,
 ) -> Bool[np.ndarray, "triples samples"]:
     """Pixels whose squares, summed over the bands in units of their variance, are distributed like noise."""
     pixels = squared[inside]
     counted = np.broadcast_to(readable, squared.shape)[inside]
-    usual = np.maximum(np.median(pixels, axis=0) / stats.chi2.median(1), QUANTISATION_VARIANCE)
+    usual = np.maximum(np.median(pixels, axis=0) / stats.chi2.median(1), least)
     degrees = np.maximum(counted.sum(axis=1), 1)
     score = (pixels / usual).sum(axis=1) / stats.chi2.median(degrees)
     limit = stats.chi2.isf(OUTLIER_PROBABILITY, degrees) / stats.chi2.median(degrees)

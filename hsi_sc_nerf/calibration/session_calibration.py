@@ -32,10 +32,11 @@ from hsi_sc_nerf.calibration.lamp_drift import (
 )
 from hsi_sc_nerf.calibration.noise import NoiseModel, measure_noise, reflectance_uncertainty
 from hsi_sc_nerf.calibration.reflectance import FrameCalibration
-from hsi_sc_nerf.calibration.white_reference import White, WhiteReference, tarp_roi
+from hsi_sc_nerf.calibration.white_reference import White, WhiteReference, require_inside, tarp_roi
 from hsi_sc_nerf.calibration.white_source import (
     WhiteSource,
     exposure_ratio,
+    has_one_white,
     measure_whites,
     panel_reflectance,
     white_cubes,
@@ -88,8 +89,8 @@ class SessionCalibration:
         defects: defects of the detector; None for "product".
         noise: noise of a reading; None for "product".
         drift_corrected: whether the frames are divided by it.
-        uncertainty: uncertainty of reflectance in the kept bands; None for "product", and where the noise
-            of a reading could not be measured.
+        one_white: whether all frames are divided by one white, so that the lamps' drift is in their reflectance.
+        uncertainty: of reflectance in the kept bands; None for "product", and where the noise is unknown.
     """
 
     source: WhiteSource
@@ -101,6 +102,7 @@ class SessionCalibration:
     defects: Defects | None = None
     noise: NoiseModel | None = None
     drift_corrected: bool = False
+    one_white: bool = False
     uncertainty: ReflectanceUncertainty | None = None
 
 
@@ -127,6 +129,10 @@ def calibrate_session(session: Session, config: CalibrationConfig) -> SessionCal
         raise InputError(
             f"{session.path}: where the white target is in the frames is not known; give its place with "
             "--calibration.roi."
+        )
+    if config.flat_field and source != "tarp":
+        raise InputError(
+            f"{session.path}: has no tarp that shows the light's falloff; leave out --calibration.flat-field."
         )
     return _from_products(session, config) if source == "product" else _from_counts(session, source, config)
 
@@ -160,13 +166,13 @@ def _from_counts(session: Session, source: WhiteSource, config: CalibrationConfi
     panel = panel_reflectance(session)
     noise = _noise(session, source, whites[0], defects)
     drift = _drift(session, darks, noise, defects)
-    # A white in every frame drifts with the lamps.
-    drift_factor = correction(drift, config.lamp_drift) if source == "tarp" else None
+    one_white = has_one_white(session, source)
+    drift_factor = correction(drift, config.lamp_drift) if one_white else None
 
     bad_bands = defects.bad_bands | np.logical_or.reduce([white.bad_bands for white in whites])
     kept = _kept(session, bad_bands)
     flat = None
-    if config.flat_field and source == "tarp":
+    if config.flat_field:
         tarp, found = session.white, whites[0]
         assert tarp is not None
         assert isinstance(found, WhiteReference)
@@ -202,6 +208,7 @@ def _from_counts(session: Session, source: WhiteSource, config: CalibrationConfi
         noise=noise,
         drift=drift,
         drift_corrected=drift_factor is not None,
+        one_white=one_white,
         uncertainty=_uncertainty(session, source, whites[0], noise, panel, kept),
     )
 
@@ -272,7 +279,9 @@ def _defects(session: Session, source: WhiteSource, config: CalibrationConfig) -
         assert session.white is not None
         # `white_reference` finds the tarp again, without the dead elements.
         roi = tarp_roi(session.white)
-    inside = np.arange(cube.shape[0])[slice(None) if roi is None else slice(max(0, roi[1]), roi[3])]
+    if roi is not None:
+        require_inside(roi, cube)
+    inside = np.arange(cube.shape[0])[slice(None) if roi is None else slice(roi[1], roi[3])]
     white = _readings(cube, dark, inside[:: -(-len(inside) // DEFECT_WHITE_LINES)])
     if white.counts.shape[1] != samples:
         white, of_frames = of_frames[0], of_frames[1:]
@@ -298,18 +307,18 @@ def _readings(cube: Cube, dark: Cube | None, rows: Int[np.ndarray, "rows"]) -> R
 def _noise(session: Session, source: WhiteSource, white: White, defects: Defects) -> NoiseModel:
     cube, dark = white_cubes(session, source)
     region = white.region(cube.shape[:2]) if isinstance(white, WhiteReference) else np.ones(cube.shape[:2], bool)
-    counts = cube.memmap()
+    counts, same_detector = cube.memmap(), cube.shape[1:] == defects.dead.shape
+    unused = np.broadcast_to(defects.dead if same_detector else False, cube.shape[1:]) | defects.bad_bands
     for number in np.flatnonzero(region.any(axis=1)):
         missing = no_data(counts[number], cube.ignore_value)
         if missing is not None:
-            region[number] &= ~missing.any(axis=-1)
-    same_detector = cube.shape[1:] == defects.dead.shape
+            region[number] &= ~(missing & ~unused).any(axis=-1)
     return measure_noise(
         counts,
         region,
         dark_counts(dark),
         saturation_counts=defects.saturation_counts,
-        dead=defects.dead if same_detector else None,
+        dead=unused,
     )
 
 

@@ -96,13 +96,9 @@ def white_reference(capture: Capture, roi: Roi | None = None, defects: Defects |
         >>> white.roi, white.pixels, white.spectrum.shape  # (1, bands)
     """
     cube = capture.cube
-    lines, samples, bands = cube.shape
+    _, samples, bands = cube.shape
     x0, y0, x1, y1 = roi = roi or tarp_roi(capture, defects)
-    if not (0 <= x0 < x1 <= samples and 0 <= y0 < y1 <= lines):
-        raise InputError(
-            f"{cube.header_path}: the given region x0 y0 x1 y1 = {tuple(roi)} is not inside its {samples} x {lines} "
-            "pixels; correct --calibration.roi."
-        )
+    require_inside(roi, cube)
     counts = np.ascontiguousarray(cube.memmap()[y0:y1, x0:x1], dtype=cube.dtype.newbyteorder("="))
     dead = _dead(defects, samples, bands)[x0:x1]
     deviation = deviation_map(fill_no_data(counts, cube.ignore_value), dead)
@@ -131,6 +127,16 @@ def white_reference(capture: Capture, roi: Roi | None = None, defects: Defects |
         mask=mask,
         kernel_px=kernel_px,
     )
+
+
+def require_inside(roi: Roi, cube: Cube) -> None:
+    """Raise InputError where a region is empty or reaches beyond an image."""
+    (x0, y0, x1, y1), (lines, samples) = roi, cube.shape[:2]
+    if not (0 <= x0 < x1 <= samples and 0 <= y0 < y1 <= lines):
+        raise InputError(
+            f"{cube.header_path}: the given region x0 y0 x1 y1 = {tuple(roi)} is not inside its {samples} x {lines} "
+            "pixels; correct --calibration.roi."
+        )
 
 
 def column_white(white: Cube, dark: Cube | None, samples: int, defects: Defects | None = None) -> White:

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from hsi_sc_nerf.calibration.detector import Defects
 from hsi_sc_nerf.calibration.white_reference import Roi, White, column_white, white_reference
 from hsi_sc_nerf.capture.envi import Cube
+from hsi_sc_nerf.capture.roles import copies_of_others
 from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.capture.session_info import SESSION_INFO_NAME
 from hsi_sc_nerf.errors import InputError
@@ -93,6 +94,14 @@ def white_cubes(session: Session, source: WhiteSource) -> tuple[Cube, Cube | Non
     white, dark = (capture.white, capture.white_dark) if source == "capture" else (capture.cube, capture.dark)
     assert white is not None
     return white, dark
+
+
+def has_one_white(session: Session, source: WhiteSource) -> bool:
+    """Whether all frames are divided by one white: a tarp, or copies of a white beside each capture."""
+    if source != "capture":
+        return source == "tarp"
+    first, *others = (frame.white.data_path for frame in session.frames if frame.white is not None)
+    return len(copies_of_others([first], {str(path): path for path in others})) == len(others)
 
 
 def exposure_ratio(capture: Capture, other: Capture) -> float:

@@ -105,7 +105,7 @@ def _in_natural_order(paths: Iterable[Path]) -> list[Path]:
 def natural_order(name: str) -> list[tuple[int, str]]:
     """Key by which names of captures or their headers are sorted."""
     parts = re.split(r"(\d+)", name.lower().removesuffix(".hdr"))
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
 def _headers_in(path: Path) -> dict[str, Path]:
@@ -156,7 +156,10 @@ def _list_plain(path: Path, found: Listing) -> None:
             f"{path}: {shared_dark[0].name} and {shared_dark[1].name} both look like the dark cube of all captures; "
             "keep one, or call each DARKREF_NAME after its capture."
         )
-    names = {name.lower(): name for name in own_names if not name.lower().startswith("dark")}
+    names: dict[str, str] = {}
+    for name in own_names:
+        if not name.lower().startswith("dark") and (twin := names.setdefault(name.lower(), name)) != name:
+            raise InputError(f"{path}: {twin} and {name} differ in capitals only; rename one of them.")
     for name in headers:
         if _is_product(name):
             names.setdefault(name.lower().removeprefix(_PRODUCT), name[len(_PRODUCT) :])

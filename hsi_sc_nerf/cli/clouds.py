@@ -129,6 +129,7 @@ class TraitsCommand:
         from hsi_sc_nerf.analysis.calibrations import read_calibration
         from hsi_sc_nerf.analysis.drawn_regions import read_drawn_regions
         from hsi_sc_nerf.analysis.library import read_library
+        from hsi_sc_nerf.analysis.traits import RegionOfInterest
         from hsi_sc_nerf.indices.catalogue import find_index
 
         check_options(self)
@@ -137,6 +138,8 @@ class TraitsCommand:
         names = [name for name, *_ in self.roi]
         if twice := [name for name in names if names.count(name) > 1]:
             raise InputError(f"--roi gives two regions the name {twice[0]}; give each a name of its own.")
+        for name, x_m, y_m, z_m, radius_m in self.roi:
+            RegionOfInterest(name, (x_m, y_m, z_m), radius_m)  # which refuses what is no region
         if self.propose_regions and self.piece is not None:
             raise InputError("--propose-regions looks at clouds of one object; leave out --piece or this option.")
         if self.library:

@@ -53,7 +53,7 @@ class DevicePixels:
         # PyTorch supports few operations on unsigned 16-bit integers; int16 holds the same bits.
         self._counts = torch.empty((*masks.shape, frames[0].cube().shape[2]), dtype=torch.int16, device=device)
         for held, frame in zip(self._counts, frames, strict=True):
-            held.copy_(torch.from_numpy(np.array(frame.cube()).view(np.int16)))
+            held.copy_(torch.from_numpy(frame.cube().astype(np.uint16).view(np.int16)))
         # A GPU multiplies by the reciprocal of a Python number, which rounds differently.
         self._scale = torch.tensor(float(REFLECTANCE_SCALE), device=device)
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+
+from hsi_sc_nerf.compiled import compiled
 
 SSIM_STABILITY = (0.01**2, 0.03**2)
 """Constants of Wang et al. 2004 (K1 = 0.01, K2 = 0.03) for a dynamic range of 1."""
@@ -21,7 +22,6 @@ SSIM_WINDOW_SIGMA_PX = 1.5
 _BANDS_AT_ONCE = 32
 """Bands whose window sums of a line of pixels are kept at a time: they fit into a processor's cache."""
 
-_compiled = numba.njit(nogil=True, cache=True, error_model="numpy")
 Images = tuple[Float[np.ndarray, "h w bands"], Float[np.ndarray, "h w bands"], Bool[np.ndarray, "h w bands"]]
 """Predicted, target, and which values of the target count; the last has no pixels where all do."""
 BandScore = Float[np.ndarray, "masks bands"]
@@ -79,7 +79,7 @@ def _in_parts(
         return list(pool.map(work, range(parts)))
 
 
-@_compiled
+@compiled
 def _add_deviations(images, masks, means, first, last, counts, sums):
     """Add p, t, p², t², p t and the squared error, where p and t are deviations from the means."""
     predicted, target, valid = images
@@ -102,7 +102,7 @@ def _add_deviations(images, masks, means, first, last, counts, sums):
                             sums[5, m, b] += error * error
 
 
-@_compiled
+@compiled
 def _add_windows(images, masks, taps, first, last, counts, sums):
     """SSIM over the windows of some lines; the kept sums are those of p, t, p², t², p t and of what is valid."""
     valid = images[2]
@@ -132,7 +132,7 @@ def _add_windows(images, masks, taps, first, last, counts, sums):
                                 sums[0, m, start + k] += score[k]
 
 
-@_compiled
+@compiled
 def _extent(lines):
     """First and end of the pixels of a line that lie in some mask."""
     left, right = lines.shape[1], 0
@@ -142,7 +142,7 @@ def _extent(lines):
     return min(left, right), right
 
 
-@_compiled
+@compiled
 def _sum_down(images, taps, y, x, start, some, sums):
     predicted, target, valid = images
     reach = len(taps) // 2
@@ -162,7 +162,7 @@ def _sum_down(images, taps, y, x, start, some, sums):
             sums[5, k] += weight if counts else 0.0
 
 
-@_compiled
+@compiled
 def _sum_across(down, taps, x, some, window):
     reach = len(taps) // 2
     window[:, :some] = 0.0
@@ -173,7 +173,7 @@ def _sum_across(down, taps, x, some, window):
                 window[moment, k] += weight * down[sample, moment, k]
 
 
-@_compiled
+@compiled
 def _score(window, some, score):
     for k in range(some):
         total = window[5, k]
@@ -182,7 +182,7 @@ def _score(window, some, score):
         score[k] = _similarity(mean_p, mean_t, variance_p, variance_t, window[4, k] / total - mean_p * mean_t)
 
 
-@_compiled
+@compiled
 def _similarity(mean_p, mean_t, variance_p, variance_t, covariance):
     """SSIM (Wang et al. 2004, Eq. 13), in [-1, 1] even where rounding has bent the moments."""
     variance_p, variance_t = np.maximum(variance_p, 0.0), np.maximum(variance_t, 0.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -22,6 +22,7 @@ from hsi_sc_nerf.evaluation.spatial import (
     sample_surface,
     threshold_curves,
 )
+from hsi_sc_nerf.geometry.camera import Similarity
 from hsi_sc_nerf.geometry.ply_file import ply_triangles, read_ply
 from hsi_sc_nerf.settings_file import between, check_options
 
@@ -244,7 +245,9 @@ def _check_sizes(
     # An alignment by features with a scale takes any size.
     if not (config.with_scale and alignment == "features") and not 1 / LARGEST_RATIO < ratio < LARGEST_RATIO:
         larger, smaller, times = (
-            (reference.name, cloud_name, ratio) if ratio > 1.0 else (cloud_name, reference.name, 1.0 / ratio)
+            (reference.name, cloud_name, ratio)
+            if ratio > 1.0
+            else (cloud_name, reference.name, 1.0 / max(ratio, 1e-12))
         )
         raise InputError(
             f"{larger}: is {times:.3g} times as large as {smaller}; the cloud has to be in metres, the reference in "
@@ -262,10 +265,14 @@ def _register(
 ) -> Registration | None:
     if alignment == "none":
         return None
-    clouds = cloud.points_m, reference.surface.points_m
+    # Near the origin, because rounding spoils Open3D's normals and equations kilometres away, as on a survey's grid.
+    there = Similarity(translation=-np.median(reference.surface.points_m, axis=0))
+    here = there if alignment == "icp" else Similarity(translation=-np.median(cloud.points_m, axis=0))
+    clouds = here(cloud.points_m), there(reference.surface.points_m)
     if alignment == "icp":
-        return refine(*clouds, with_scale=config.with_scale)
-    found = align_by_features(*clouds, config.with_scale, lambda starts: track(starts, "Trying other attitudes"))
+        found = refine(*clouds, with_scale=config.with_scale)
+    else:
+        found = align_by_features(*clouds, config.with_scale, lambda starts: track(starts, "Trying other attitudes"))
     if found.rival is not None and not config.accept_symmetric:
         raise InputError(
             f"{cloud_name}: features do not determine its attitude in {reference.name}, because turned by "
@@ -273,4 +280,4 @@ def _register(
             f"{1000 * found.rival.taken_rms_m:.2f} mm); bring the two together by hand and use --align icp, or take "
             "either attitude with --accept-symmetric."
         )
-    return found
+    return replace(found, transform=there.inverse().after(found.transform).after(here))

@@ -137,7 +137,7 @@ def _write_distance_ply(
 ) -> None:
     """Points with their distance as colour and as ``scalar_distance_m``, a scalar field in CloudCompare."""
     colours = colormaps[INDEX_COLOURS](np.clip(distances_m / limit_m, 0, 1), bytes=True)[:, :3]
-    columns = dict(zip("xyz", points_m.T.astype(np.float32), strict=True))
+    columns = dict(zip("xyz", points_m.T, strict=True))
     columns |= dict(zip(("red", "green", "blue"), colours.T, strict=True))
     columns["scalar_distance_m"] = distances_m.astype(np.float32)
     PlyData([ply_vertices(columns)], byte_order="<").write(str(path))

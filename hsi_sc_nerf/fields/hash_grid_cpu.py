@@ -16,12 +16,13 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
+from hsi_sc_nerf.compiled import compiled
+
 _PRIME_Y, _PRIME_Z = 2654435761, 805459861  # Müller et al. 2022, Eq. 4; the first is 1
 _SHARED_FROM = 4096
 """Points from which on threads are worth waking."""
 
-compiled = numba.njit(nogil=True, cache=True, error_model="numpy")
-shared = numba.njit(nogil=True, cache=True, error_model="numpy", parallel=True)
+shared = compiled(parallel=True)
 
 # On Linux these are the threads of torch: others would have to wait for its own, which go on spinning on their cores
 # for milliseconds after every operation.

@@ -9,7 +9,8 @@ import numba
 import numpy as np
 from jaxtyping import Float32
 
-from hsi_sc_nerf.fields.hash_grid_cpu import compiled, run_in_parts, shared
+from hsi_sc_nerf.compiled import compiled
+from hsi_sc_nerf.fields.hash_grid_cpu import run_in_parts, shared
 
 
 def sample_occupied(

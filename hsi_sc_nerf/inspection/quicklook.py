@@ -27,6 +27,7 @@ from hsi_sc_nerf.calibration.reference_checks import bright_pixels
 from hsi_sc_nerf.calibration.white_source import exposure_ratio, panel_reflectance
 from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.poses.session_pictures import edge_slope
+from hsi_sc_nerf.robust_scatter import robust_std
 from hsi_sc_nerf.spectra import nearest_bands, to_8_bit
 
 PICTURE_NM = (640.0, 550.0, 470.0)
@@ -98,7 +99,7 @@ def quicklook_of(capture: Capture, white: Float[np.ndarray, "bands"]) -> Quicklo
     read, light = fill_no_data(lines, cube.ignore_value), light_above(lines, dark, cube.ignore_value)
     channels, noise = nearest_bands(cube.wavelengths_nm, PICTURE_NM), np.zeros(cube.shape[2])
     if dark is not None:
-        noise = np.asarray(dark, np.float32).std(axis=0).mean(axis=0)
+        noise = _noise_above(np.asarray(dark, np.float32))
     level = dark_columns(dark, *cube.shape[1:]).mean(axis=0)
     bands = [slice(max(0, band - NEIGHBOURS // 2), max(0, band - NEIGHBOURS // 2) + NEIGHBOURS) for band in channels]
     picture = np.stack(
@@ -167,6 +168,15 @@ def sharpness_per_px(picture: Float[np.ndarray, "lines samples"]) -> float:
     smooth = cv2.GaussianBlur(np.asarray(picture, np.float32), (0, 0), 0.7)
     low, high = np.percentile(smooth, [1.0, 99.0])
     return edge_slope(smooth) / float(high - low) if high > low else 0.0
+
+
+def _noise_above(dark: Float[np.ndarray, "dark_lines dark_samples bands"]) -> Float[np.ndarray, "bands"]:
+    """Standard deviation of a reading without light less the dark cube's mean, by band."""
+    lines = len(dark)
+    # A single line does not tell its noise; its elements differ by their pattern as well.
+    pattern = np.diff(dark[0], axis=0) / np.sqrt(2.0)
+    spread = dark.std(axis=0, ddof=1).mean(axis=0) if lines > 1 else robust_std(pattern, axis=0)
+    return spread * np.sqrt(1.0 + 1.0 / lines)
 
 
 def _mean_counts(

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
 
+from hsi_sc_nerf.compiled import compiled
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, PixelFlag
 from hsi_sc_nerf.packed.pixels import PixelReader
 from hsi_sc_nerf.surface.depth_renders import DepthRenders
@@ -62,10 +62,7 @@ def view_statistics(
     return dict(zip(STATISTICS, (views, std, invalid / np.maximum(views, 1)), strict=True))
 
 
-_compiled = numba.njit(nogil=True, cache=True, error_model="numpy")
-
-
-@_compiled
+@compiled
 def _add(packed, pixel_of_row, rows, near_mean, sums, squares, counts):
     """Add measured spectra, each to its point.
 
@@ -83,7 +80,7 @@ def _add(packed, pixel_of_row, rows, near_mean, sums, squares, counts):
             counts[row, band] += measured
 
 
-@_compiled
+@compiled
 def _mean_deviation(sums, squares, counts, std):
     """Standard deviation over the views, mean over the bands with two views at least; NaN without such a band."""
     for row in range(len(std)):

@@ -206,6 +206,12 @@ def test_models_of_scikit_learn_as_onnx(tmp_path, capfd, model, column, rtol):
     assert capfd.readouterr() == ("", "")  # one sentence, and nothing of onnxruntime's beside it
 
 
+def test_a_key_that_is_left_empty_is_not_given(tmp_path):
+    path = tmp_path / "brix.csv"
+    path.write_text("# name:\n# model:\n# intercept: 1\nwavelength_nm,coefficient\n400,1\n")
+    assert read_calibration(path).name == "brix"
+
+
 @pytest.mark.parametrize(
     ("text", "why"),
     [
@@ -232,6 +238,11 @@ def test_models_of_scikit_learn_as_onnx(tmp_path, capfd, model, column, rtol):
         (
             "# intercept: 0\n# t2_limit: 3\nwavelength_nm,coefficient,mean,weight_1,loading_1\n400,1,1,1,1\n",
             "needs score_variances",
+        ),
+        (
+            "# intercept: 0\n# q_limit: 1\n# t2_limit: NA\nwavelength_nm,coefficient,mean,weight_1,loading_1\n"
+            "400,1,1,1,1\n",
+            "must be numbers",
         ),
         ("# model: none.onnx\nwavelength_nm\n400\n", "none.onnx: is missing, but own.csv names it"),
     ],

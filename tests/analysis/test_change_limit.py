@@ -52,6 +52,17 @@ def compared(*days, repeat=None):
     return list(compare_days(days, (), (), 0.01, LIBRARY, repeat=repeat))
 
 
+def test_an_index_that_the_typical_spectrum_has_not_is_compared_where_it_is_defined():
+    def dark(seed):
+        one = day(seed)
+        one.surface.spectra[BALL.vertices[:, 0] < 0.005, 0] *= -1.0
+        return one
+
+    index = SpectralIndex("X", "sqrt(R500)")
+    (told,) = compare_days([dark(0), dark(1)], (), [index], 0.01, repeat=dark(3))
+    assert np.isfinite(told.quantities["X"].whole[1])
+
+
 def rows_of(comparisons, kind, name="brightness"):
     regions = change_rows(comparisons)
     return [

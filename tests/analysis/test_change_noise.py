@@ -83,3 +83,13 @@ def test_the_correlation_length_of_an_exponential_field_is_found():
     length_m, independent = correlation(field, centres_m)
     assert length_m == pytest.approx(0.008, rel=0.3)
     assert independent == pytest.approx(900**2 / np.exp(-distance_m / 0.008).sum(), rel=0.6)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_few_scattered_patches_have_a_correlation_length_of_at_least_zero(seed):
+    random = np.random.default_rng(seed)
+    directions = random.normal(size=(20, 3))
+    centres_m = 0.05 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    length_m, independent = correlation(random.normal(size=(20, 1)), centres_m)
+    assert length_m >= 0.0
+    assert 1.0 <= independent <= 20.0 + 1e-9

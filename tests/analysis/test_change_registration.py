@@ -87,3 +87,12 @@ def test_gradients_of_a_linear_function_on_a_tilted_plane_are_its_slopes_along_t
     slopes = random.normal(size=(2, 3))
     found = surface_gradients(points, points @ slopes.T)
     np.testing.assert_allclose(found, np.broadcast_to(slopes @ along.T @ along, found.shape), atol=1e-9)
+
+
+def test_a_point_without_a_value_takes_no_gradient_from_its_neighbours():
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(20.0), np.arange(20.0)))
+    values = (2.0 * x - 3.0 * y)[:, None]
+    values[205] = np.nan
+    found = surface_gradients(np.stack([x, y, 0.0 * x], axis=1), values)[:, 0]
+    assert np.isnan(found[205]).all()
+    np.testing.assert_allclose(np.delete(found, 205, axis=0), np.tile([2.0, -3.0, 0.0], (399, 1)), atol=1e-9)

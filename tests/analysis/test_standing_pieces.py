@@ -109,6 +109,14 @@ def test_each_object_is_measured_by_itself(tmp_path):
     assert (tmp_path / "piece-1" / "region_spectra.png").is_file()
 
 
+@pytest.mark.parametrize("far_m", [np.nan, np.inf, 1e6])
+def test_a_point_that_is_nowhere_or_far_away_is_told(far_m):
+    points, normals, _ = balls((1.0, [0, 0, 0]))
+    points[7, 1] = far_m
+    with pytest.raises(InputError, match="not finite or kilometres apart|too large for a smoothing radius"):
+        measure_traits(cloud_of(points, normals), splits=0)
+
+
 def files_in(folder):
     return [str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()]
 

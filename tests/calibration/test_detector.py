@@ -262,3 +262,9 @@ def test_dark_counts_without_data_are_left_out():
     dark = np.full((4, 3, 2), 100.0, np.float32)
     dark[1, 2, 0] = np.nan
     np.testing.assert_array_equal(dark_columns(dark, 3, 2), np.full((3, 2), 100.0))
+
+
+def test_a_panel_that_fills_less_than_half_of_its_lines_lights_all_bands():
+    counts = np.zeros((8, 48, 6), np.uint16)
+    counts[:, 8:20] = 2000
+    assert not find_defects(Readings(counts)).bad_bands.any()

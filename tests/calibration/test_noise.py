@@ -64,6 +64,15 @@ def test_slope_despite_an_uneven_tarp(tarp):
     assert noise.counts_per_electron == pytest.approx(COUNTS_PER_ELECTRON, rel=0.03)
 
 
+def test_numbers_on_another_scale_than_counts_have_the_noise_of_that_scale():
+    white, dark = exposures()
+    expected = measure_noise(white, REGION, dark)
+    for lines in (64, 1):
+        found = measure_noise(white.astype(np.float32) * 1e-4, REGION, 1e-4 * dark[:lines])
+        assert found.counts_per_electron == pytest.approx(1e-4 * expected.counts_per_electron, rel=0.02)
+        np.testing.assert_allclose(found.read_noise, 1e-4 * expected.read_noise, rtol=0.1)
+
+
 def test_saturated_readings_and_dead_elements_are_left_out():
     white, dark = exposures(1.25)
     stuck = np.random.default_rng(4).random((SAMPLES, BANDS)) < 0.1

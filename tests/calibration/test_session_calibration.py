@@ -8,6 +8,7 @@ import pytest
 from calibration_score import CalibrationScore, score_calibration
 from capture_factory import BANDS, DARK, LAMP, SIZE_PX, WAVELENGTHS_NM, expose, write_capture, write_session
 
+from hsi_sc_nerf.calibration.calibration_checks import check_calibration
 from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, SessionCalibration, calibrate_session
 from hsi_sc_nerf.capture.envi import Cube, open_cube, write_cube
 from hsi_sc_nerf.capture.session import Capture, Session, open_session
@@ -230,6 +231,36 @@ def test_other_sources_of_white(tmp_path):
     assert not by_target.drift_corrected
 
 
+@pytest.mark.parametrize("copies", [True, False])
+def test_drift_is_taken_off_where_one_white_was_copied_beside_every_frame(tmp_path, copies):
+    effects = ["{lamp_drift: {percent: -6}}", "photon_noise", "read_noise"]
+    scene = override(load_scene("sphere"), size_px=48, bands=12, frames=4, effects=effects)
+    folder = simulate_session(scene, tmp_path / "session", progress=False)
+    session = open_session(folder)
+    for number, capture in enumerate(session.frames):
+        own_white(session, capture, lines=3 if copies else 3 + number)
+    session = open_session(folder)
+    calibration = calibrate_session(session, CalibrationConfig(white_source="capture"))
+    assert calibration.drift_corrected == copies
+    told = {finding.name: finding.sentence for finding in check_calibration(session, calibration)}["drift"]
+    assert ("every frame has a white of its own" in told) != copies
+
+
+def test_a_band_without_data_leaves_the_uncertainty_of_the_others(tmp_path):
+    scene = override(load_scene("sphere"), size_px=48, bands=12, frames=3, effects=["photon_noise", "read_noise"])
+    session = open_session(simulate_session(scene, tmp_path / "session", progress=False))
+    whole = calibrate_session(session, CalibrationConfig())
+    for capture in session.captures:
+        for cube in (capture.cube, capture.dark):
+            counts = cube.read()
+            counts[..., 3] = 0
+            rewrite(cube, counts, **{"data ignore value": 0})
+    calibration = calibrate_session(open_session(session.path), CalibrationConfig(flat_field=True))
+    assert 3 not in calibration.bands
+    assert calibration.uncertainty is not None
+    assert calibration.noise.counts_per_electron == pytest.approx(whole.noise.counts_per_electron, rel=0.05)
+
+
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory) -> Session:
     scene = override(load_scene("sphere"), size_px=24, bands=4, frames=2, effects=[])
@@ -243,6 +274,9 @@ def tiny(tmp_path_factory) -> Session:
         (CalibrationConfig(white_source="product"), "white-source"),
         (CalibrationConfig(white_source="target"), "roi"),
         (CalibrationConfig(bounds=(0.0, 2.0)), "bounds"),
+        (CalibrationConfig(roi=(0, 600, 10, 700)), "roi"),
+        (CalibrationConfig(roi=(0, 9, 9, 9)), "roi"),
+        (CalibrationConfig(white_source="target", roi=(0, 0, 8, 8), flat_field=True), "flat-field"),
     ],
 )
 def test_settings_that_do_not_fit(tiny, config, option):

@@ -9,7 +9,7 @@ from capture_factory import BANDS, SIZE_PX, WAVELENGTHS_NM
 
 from hsi_sc_nerf.calibration.white_source import white_source
 from hsi_sc_nerf.capture.envi import write_cube
-from hsi_sc_nerf.capture.instrument import read_metadata
+from hsi_sc_nerf.capture.instrument import natural_order, read_metadata
 from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.processing.frames import capture_files, session_files
@@ -226,6 +226,17 @@ def test_a_renamed_folder(tmp_path):
     assert [frame.name for frame in session.frames] == ["445", "apple_left"]
     assert name_of(session.frames[1].white) == "WHITEREF_444"
     assert session.frames[1].metadata.path.name == "444.xml"
+
+
+def test_names_that_differ_in_capitals_only_are_refused(tmp_path):
+    for name in ("Ball_1", "ball_1", "ball_2"):
+        write(tmp_path / f"{name}.hdr", COUNTS)
+    with pytest.raises(InputError, match="Ball_1 and ball_1 differ in capitals only"):
+        open_session(tmp_path)
+
+
+def test_a_digit_that_is_no_number_is_a_letter():
+    assert natural_order("apple_2²") < natural_order("apple_10")
 
 
 def test_plain_folder_with_the_same_prefixes(tmp_path):

@@ -72,6 +72,7 @@ def test_nonsense_is_one_sentence(config, told):
         (SessionSettings(traits="--library none.csv"), r"--traits: none\.csv"),
         (SessionSettings(traits="--roi-file none.json"), r"--traits: none\.json"),
         (SessionSettings(traits="--roi a 0 0 0 1 --roi a 0 0 1 1"), "--traits: --roi gives two regions the name a"),
+        (SessionSettings(traits="--roi a 0 0 0 -1"), "--traits: region a: needs x y z and a radius above 0"),
         (SessionSettings(material="--white-azimuth-deg nan"), "--material: --white-azimuth-deg is nan"),
         (SessionSettings(material="--light none.json"), r"--material: none\.json: cannot be read"),
     ],

@@ -23,7 +23,7 @@ BALL = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS_M)
 
 
 def write_cloud(path: Path, points: np.ndarray) -> Path:
-    rows = np.empty(len(points), [(axis, "f4") for axis in "xyz"])
+    rows = np.empty(len(points), [(axis, "f8") for axis in "xyz"])
     for axis, values in zip("xyz", points.T, strict=True):
         rows[axis] = values
     PlyData([PlyElement.describe(rows, "vertex")]).write(str(path))
@@ -142,6 +142,15 @@ def test_icp_brings_a_shifted_cloud_back(mesh: Path, tmp_path: Path) -> None:
     assert found.to_reference_m.max() < 2e-4
 
 
+def test_icp_is_as_good_on_a_survey_grid(tmp_path: Path) -> None:
+    origin_m, shift_m = np.array([4.5e5, 5.2e6, 120.0]), np.array([0.003, -0.002, 0.001])
+    reference = write_cloud(tmp_path / "reference.ply", on_ball(20_000) + origin_m)
+    cloud = write_cloud(tmp_path / "cloud.ply", on_ball(3000, seed=1) + origin_m + shift_m)
+    found = compared(cloud, reference, CompareConfig(align="icp", points=20_000))
+    assert found.registration is not None
+    np.testing.assert_allclose(found.registration.transform(origin_m[None] + shift_m) - origin_m, 0.0, atol=1e-4)
+
+
 @pytest.mark.slow
 def test_a_symmetric_shape_is_said_to_be_one(mesh: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = Registration(Similarity(), 0.001, Rival(90.0, 0.0001, 0.0001))
@@ -193,3 +202,9 @@ def test_a_folder_without_truth_and_a_cloud_too_thin_to_align(mesh: Path, sessio
     thin = write_cloud(tmp_path / "thin.ply", on_ball(20))
     with pytest.raises(InputError, match=r"thin\.ply: has 20 points, too few"):
         compared(thin, mesh, CompareConfig(points=500))
+
+
+def test_a_reference_of_one_point_is_told_to_be_too_small(mesh: Path, tmp_path: Path) -> None:
+    point = write_cloud(tmp_path / "point.ply", np.zeros((1, 3)))
+    with pytest.raises(InputError, match="times as large"):
+        compared(mesh, point, CompareConfig(align="none", points=2000))

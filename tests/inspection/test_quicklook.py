@@ -9,6 +9,7 @@ from inspection_session import INFO, WAVELENGTHS_NM, rendered, write_white
 
 from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.capture.session import open_session
+from hsi_sc_nerf.inspection.capture_checks import DARK_RED
 from hsi_sc_nerf.inspection.inspect import inspect_session
 from hsi_sc_nerf.inspection.quicklook import Quicklook, quicklooks_of, reflectance_noise
 from hsi_sc_nerf.poses.marker_detection import detect_markers, marker_pattern
@@ -76,3 +77,15 @@ def test_finished_reflectance_beside_a_raw_white(session):
     # The brightest part of a frame is paper.
     assert inspection.quicklooks[0].picture.mean() == pytest.approx(expected / 0.76, rel=0.2)
     assert inspection.markers.usual_step_deg == pytest.approx(30.0, abs=0.5)
+
+
+@pytest.mark.parametrize("lines", [1, 2, 8])
+def test_a_covered_frame_is_dark_however_few_lines_its_dark_cube_has(session, lines):
+    rng = np.random.default_rng(0)
+    for prefix, shape in (("", (128, 128, 9)), ("DARKREF_", (lines, 128, 9))):
+        header = session / "fruit_00" / "capture" / f"{prefix}fruit_00.hdr"
+        counts = np.rint(rng.normal(100.0, 4.0, shape)).astype(np.uint16)
+        write_cube(header, counts, wavelengths_nm=WAVELENGTHS_NM, extra_header={"tint": 10})
+    covered, lit, *_ = quicklooks_of(open_session(session))
+    assert covered.dark_fraction.mean() > DARK_RED
+    assert lit.dark_fraction.mean() < 0.05
