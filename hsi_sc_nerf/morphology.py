@@ -12,10 +12,12 @@ def ellipse_close_open(
     mask: Bool[np.ndarray, "lines samples"], *, close_px: int, open_px: int
 ) -> Bool[np.ndarray, "lines samples"]:
     """Morphological closing, then opening, each with an ellipse of the given diameter (below 2 it is skipped)."""
-    for operation, size in ((cv2.MORPH_CLOSE, close_px), (cv2.MORPH_OPEN, open_px)):
+    # cv2.morphologyEx does not mirror the ellipse between the two halves, which moves masks where its size is even.
+    for (first, second), size in (((cv2.dilate, cv2.erode), close_px), ((cv2.erode, cv2.dilate), open_px)):
         if size >= 2:
             ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-            mask = cv2.morphologyEx(mask.astype(np.uint8), operation, ellipse) > 0
+            once = first(mask.astype(np.uint8), ellipse)
+            mask = second(once, ellipse[::-1, ::-1].copy(), anchor=((size - 1) // 2,) * 2) > 0
     return mask
 
 

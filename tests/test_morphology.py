@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from hsi_sc_nerf.morphology import beside
+from hsi_sc_nerf.morphology import beside, ellipse_close_open
 
 
 @pytest.fixture
@@ -29,3 +29,10 @@ def test_pixels_beside_a_mask_are_within_the_width(mask):
 def test_nothing_is_beside_an_empty_or_a_full_mask(mask):
     assert not beside(np.zeros_like(mask), 2).any()
     assert not beside(np.ones_like(mask), 2).any()
+
+
+@pytest.mark.parametrize("size", range(2, 12))
+def test_closing_adds_and_opening_takes_away(size):
+    mask = np.random.default_rng(size).random((60, 70)) > 0.5
+    assert ellipse_close_open(mask, close_px=size, open_px=0)[mask].all()
+    assert mask[ellipse_close_open(mask, close_px=0, open_px=size)].all()

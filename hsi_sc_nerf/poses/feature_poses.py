@@ -66,6 +66,8 @@ class KnownCamera:
     """The turntable's turn seen from above; None if the earlier session does not show it."""
     metric: bool = True
     """Whether lengths are metres; otherwise the earlier session had no scale."""
+    on_disc: bool = True
+    """Whether the origin is on the disc."""
 
     @property
     def distance_m(self) -> float | None:
@@ -138,6 +140,7 @@ def poses_from_known_camera(
             *(() if camera.metric else (_no_scale("give camera_distance_m"),)),
         ),
         method="angles",
+        disc_by_container=camera.on_disc,
         metric=camera.metric,
     )
 

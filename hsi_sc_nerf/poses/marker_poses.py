@@ -92,7 +92,10 @@ def poses_from_markers(
     turntable = adjusted.turntable
     found = [Finding("poses-markers", "amber", f"Marker {m} stands still and was left out.") for m in static]
     if not lie_on_disc(turntable.corners()).any():
-        sentence = "No marker lies on the disc: the origin is at the height of the lowest marker corner."
+        sentence = (
+            "No marker lies on the disc: the origin is at the height of the lowest marker corner, and where the "
+            "container's lid is remains unknown; put a marker flat on the disc."
+        )
         found.append(Finding("poses-origin", "amber", sentence))
     found += check_pixel_aspect(*pixel_aspect(adjusted, kept))
     errors_px, overall_px = turntable.frame_errors_px(kept, len(names))

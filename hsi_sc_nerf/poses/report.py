@@ -259,7 +259,8 @@ def draw_poses(poses: TurntablePoses, report: dict, path: Path) -> None:
     for corners in poses.marker_corners_m.values():
         top.plot(*np.vstack([corners, corners[:1]])[:, :2].T, color="black", linewidth=0.8)
     top.annotate(poses.names[int(np.flatnonzero(poses.used)[0])], (eyes[0, 0], eyes[0, 1]), fontsize=8)
-    top.set(xlabel="x (m)", ylabel="y (m)", title="Cameras in the object frame, from above")
+    unit = "m" if poses.metric else "distances of the camera"
+    top.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})", title="Cameras in the object frame, from above")
     top.set_aspect("equal")
 
     error = figure.add_subplot(grid[0, 1])

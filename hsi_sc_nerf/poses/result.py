@@ -111,7 +111,7 @@ class TurntablePoses:
     blur_px: float = 0.0
     disc_markers: tuple[int, ...] = ()
     disc_by_container: bool = False
-    """Whether the foot of the container's outline gives the height of the disc."""
+    """Whether the foot of the container's outline, or an earlier dataset, gives the height of the disc."""
     disc_tilt_deg: float | None = None
     loop_closure_deg: float | None = None
     findings: tuple[Finding, ...] = ()

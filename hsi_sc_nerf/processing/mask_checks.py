@@ -15,7 +15,7 @@ from hsi_sc_nerf.processing.visual_hull import VotedHull
 from hsi_sc_nerf.robust_scatter import robust_std
 
 MAX_EMPTY_FRACTION = 0.05
-"""Fraction of frames without a mask that is tolerated; the visual hull tolerates as many."""
+"""Fraction of frames without a mask that is tolerated."""
 MAX_CUT_FRACTION = 0.3
 """Fraction of a mask's lines that may end at the side of the space where the object may be."""
 CUT_LINES, CUT_FRAMES = 0.05, 0.1

@@ -166,7 +166,7 @@ def foreground_mask(
 
 
 def _closing_px(image: Float[np.ndarray, "h w"]) -> int:
-    return max(3, round(CLOSING_FRACTION * min(image.shape)))
+    return max(3, round(CLOSING_FRACTION * min(image.shape))) | 1  # odd
 
 
 def above_lid(

@@ -121,8 +121,7 @@ def posed_frames(output_dir: Path, poses: TurntablePoses) -> list[PackedFrame]:
 def container_under(session: Session, poses: TurntablePoses) -> Container | None:
     """The container, if its size is known and the object frame is in metres with the container on z = 0."""
     diameter_m, height_m = session.info.container_diameter_m, session.info.container_height_m
-    seen = bool(poses.disc_markers) or poses.disc_by_container
-    feet_known = seen or poses.method == "markers" or not np.isfinite(poses.overall_error_px)
+    feet_known = bool(poses.disc_markers) or poses.disc_by_container
     if diameter_m is None or height_m is None or not poses.metric or not feet_known:
         return None
     return Container(diameter_m, height_m)
@@ -140,4 +139,5 @@ def known_camera(earlier: PackedDataset) -> KnownCamera:
         camera_to_world=turntable_camera_to_world(first.camera_to_world, -first.angle_deg),
         direction=None if len(forward) != 1 else "ccw" if True in forward else "cw",
         metric=earlier.metric,
+        on_disc=earlier.container is not None or earlier.pose_method == "markers",
     )

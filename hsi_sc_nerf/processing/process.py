@@ -111,6 +111,11 @@ def process_session(
     config, output_dir = config or ProcessConfig(), Path(output_dir)
     if output_dir.resolve() == Path(session_dir).resolve():
         raise InputError(f"{output_dir}: is the session itself; choose another --output-dir.")
+    if (
+        config.camera is not None
+        and transforms_path(config.camera).resolve() == transforms_path(output_dir).resolve()
+    ):
+        raise InputError(f"{output_dir}: is the dataset that --camera names; choose another --output-dir.")
     check_options(config)
     require_checks(config.accept)
     require_writable(output_dir)

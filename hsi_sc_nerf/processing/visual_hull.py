@@ -95,6 +95,7 @@ def voted_hull(
     distance = np.linalg.norm(camera_to_worlds[:, :3, 3] - centre, axis=1).min()
     reach = distance * max(intrinsics.w / intrinsics.fl_x, intrinsics.h / intrinsics.fl_y) / 2.0
     low, high = centre - reach, centre + reach
+    shown = masks.any(axis=(1, 2)) | (not masks.any())  # an empty mask does not tell where the object is
     for _ in range(2):
         sides = (high - low) / GRID_CELLS
         ticks = [low[k] + sides[k] * (np.arange(GRID_CELLS) + 0.5) for k in range(3)]
@@ -103,11 +104,11 @@ def voted_hull(
             points = points[points[:, 2] >= min_z_m - sides[2] / 2.0]
         voxel_px = 2 * int(np.ceil(intrinsics.fl_x * np.linalg.norm(sides) / 2.0 / distance)) + 1
         dilated = np.stack([dilate(mask, voxel_px) for mask in masks])
-        voxels = visual_hull(points, dilated, camera_to_worlds, intrinsics, HULL_MISSED_FRACTION)
+        voxels = visual_hull(points, dilated[shown], camera_to_worlds[shown], intrinsics, HULL_MISSED_FRACTION)
         if len(voxels) == 0:
             break
         low, high = voxels.min(axis=0) - sides / 2.0, voxels.max(axis=0) + sides / 2.0
-    core = visual_hull(voxels, dilated, camera_to_worlds, intrinsics)
+    core = visual_hull(voxels, dilated[shown], camera_to_worlds[shown], intrinsics)
     silhouettes, core_silhouettes = (
         np.stack([_silhouette(seen, pose, intrinsics, voxel_px) for pose in camera_to_worlds])
         for seen in (voxels, core)

@@ -113,7 +113,7 @@ def test_each_object_is_measured_by_itself(tmp_path):
 def test_a_point_that_is_nowhere_or_far_away_is_told(far_m):
     points, normals, _ = balls((1.0, [0, 0, 0]))
     points[7, 1] = far_m
-    with pytest.raises(InputError, match="not finite or kilometres apart|too large for a smoothing radius"):
+    with pytest.raises(InputError, match=r"not finite or kilometres apart|too large for a smoothing radius"):
         measure_traits(cloud_of(points, normals), splits=0)
 
 

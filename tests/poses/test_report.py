@@ -7,6 +7,7 @@ import pytest
 from capture_factory import true_poses
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
+from hsi_sc_nerf.poses import report
 from hsi_sc_nerf.poses.report import check_poses, pose_report
 from hsi_sc_nerf.poses.result import Scale, Uncertainty
 
@@ -22,6 +23,15 @@ def levels(poses, info=STEPS):
 
 UNSURE = replace(GOOD, uncertainty=Uncertainty(0.01, 0.01, 0.01, np.full(4, 0.01), 0.5, 0.0004))
 FEATURES = {"method": "colmap", "dictionary": None, "metric": False}
+
+
+@pytest.mark.parametrize(("metric", "unit"), [(True, "m"), (False, "distances of the camera")])
+def test_the_figure_states_the_unit_of_lengths(monkeypatch, tmp_path, metric, unit):
+    drawn = []
+    monkeypatch.setattr(report, "save_figure", lambda figure, path: drawn.append(figure))
+    poses = replace(GOOD, metric=metric)
+    report.draw_poses(poses, pose_report(poses, STEPS), tmp_path / "poses.png")
+    assert drawn[0].axes[0].get_xlabel() == f"x ({unit})"
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ from hsi_sc_nerf.processing import process, session_masks
 from hsi_sc_nerf.processing.frames import pack_frames
 from hsi_sc_nerf.processing.masks import MaskConfig, foreground_masks
 from hsi_sc_nerf.processing.painted_masks import painted_box
-from hsi_sc_nerf.processing.posed_frames import known_camera
+from hsi_sc_nerf.processing.posed_frames import container_under, known_camera
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
 
 ANGLES_DEG = (0.0, 90.0, 180.0, 270.0)
@@ -82,6 +82,14 @@ def rewritten(output, before: dict[str, int]) -> list[str]:
 
 def no_markers(images, names, **_):
     raise InputError("no marker was found")
+
+
+@pytest.mark.slow
+def test_the_dataset_that_gives_the_camera_is_not_replaced(processed):
+    session, output = processed
+    with pytest.raises(InputError, match="that --camera names"):
+        run(session, output, ProcessConfig(camera=output), poses=no_markers)
+    assert (output / "transforms.json").exists()
 
 
 @pytest.mark.slow
@@ -247,10 +255,26 @@ def test_a_changed_earlier_camera_is_noticed(processed, tmp_path):
 def test_an_earlier_session_tells_how_the_table_turns(angles_deg, direction):
     frames = [SimpleNamespace(angle_deg=angle, camera_to_world=true_pose(angle)) for angle in angles_deg]
     for metric in (True, False):
-        earlier = SimpleNamespace(frames=frames, intrinsics=INTRINSICS, distortion=np.zeros(4), metric=metric)
-        camera = known_camera(earlier)
-        assert (camera.direction, camera.metric) == (direction, metric)
+        for method, on_disc in (("markers", True), ("colmap", False)):
+            earlier = SimpleNamespace(
+                frames=frames,
+                intrinsics=INTRINSICS,
+                distortion=np.zeros(4),
+                metric=metric,
+                container=None,
+                pose_method=method,
+            )
+            camera = known_camera(earlier)
+            assert (camera.direction, camera.metric, camera.on_disc) == (direction, metric, on_disc)
     np.testing.assert_allclose(camera.camera_to_world, true_pose(0.0), atol=1e-12)
+
+
+def test_without_a_known_height_of_the_disc_that_of_the_lid_is_unknown():
+    session = SimpleNamespace(info=SimpleNamespace(container_diameter_m=0.09, container_height_m=0.07))
+    poses = true_poses([None] * 4, ["a", "b", "c", "d"])
+    assert container_under(session, poses) == Container(0.09, 0.07)
+    assert container_under(session, replace(poses, disc_markers=())) is None
+    assert container_under(session, replace(poses, disc_markers=(), disc_by_container=True)) is not None
 
 
 @pytest.mark.slow
