@@ -91,7 +91,7 @@ def _cost(step: str, content: Mapping[str, Any]) -> Iterator[tuple[Column, Value
     yield columns.STATUS, str(content["status"])
     # As an error's text it is one line, of a length that can be read.
     yield columns.SENTENCE, str(InputError(content.get("sentence") or ""))
-    # Nothing was run, and 0 recorded, where a step was skipped or up to date.
+    # Nothing was run, and 0 recorded, where a step was skipped.
     yield columns.SECONDS[step], _number(content.get("seconds")) or None
     yield columns.MEMORY[step], _number(content.get("peak_memory_mib")) or None
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast, get_args
 
 from hsi_sc_nerf.batch.session_list import OBJECT, SESSION, Row, read_sessions, sessions_table
-from hsi_sc_nerf.batch.session_steps import SessionSettings, Step, is_up_to_date, session_steps
+from hsi_sc_nerf.batch.session_steps import STEPS_NAME, SessionSettings, Step, is_up_to_date, session_steps
 from hsi_sc_nerf.benchmark.configurations import split_words
 from hsi_sc_nerf.errors import InputError, shown
 from hsi_sc_nerf.files import atomic_write, make_folder, read_json, write_json
@@ -159,12 +160,22 @@ def _require_free(out: Path, rows: Sequence[Row]) -> None:
     except InputError:
         return  # damaged, and now written anew
     for row in rows:
-        before, results = earlier.get(row[OBJECT], row[SESSION]), out / OBJECTS_NAME / row[OBJECT]
+        results = out / OBJECTS_NAME / row[OBJECT]
+        before = earlier.get(row[OBJECT]) or _session_of(results) or row[SESSION]
         # A session that is no longer there was moved.
         if before != row[SESSION] and Path(before).is_dir() and results.is_dir():
             raise InputError(
                 f"{results}: is of another session, {before}; choose another --output-dir, or delete it first."
             )
+
+
+def _session_of(results: Path) -> str:
+    """The session that results are of, also where the last list does not name them; empty where nothing tells."""
+    path = results / STEPS_NAME
+    try:
+        return shlex.split(read_json(path, _AGAIN)["inspect"]["command"])[2] if path.is_file() else ""
+    except (InputError, LookupError, TypeError, AttributeError, ValueError):
+        return ""
 
 
 def _check_types(settings: SessionSettings) -> None:

@@ -101,7 +101,7 @@ def _read_table(path: Path) -> Iterator[tuple[int, Row]]:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give a folder of sessions or a CSV.") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: is no UTF-8 text; save it as 'CSV UTF-8' in the spreadsheet.") from error
-    first = text.partition("\n")[0]
+    first = re.sub('"[^"]*"', "", next((line for line in text.splitlines() if line.strip()), ""))
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=max(",;\t", key=first.count), strict=True)
     try:
         lines = [(reader.line_num, stripped) for cells in reader if any(stripped := [cell.strip() for cell in cells])]

@@ -74,8 +74,8 @@ class Step:
         for path in map(Path.resolve, self.inputs):
             inside = outside in path.parents
             root = outside if inside else path if path.is_dir() else path.parent
-            for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
-                if file.is_file() and (inside or outside not in file.parents):
+            for file in _files_below(path, None if inside else outside) if path.is_dir() else [path]:
+                if file.is_file():
                     state = file.stat()
                     digest.update(f"{file.relative_to(root)} {state.st_size} {state.st_mtime_ns}\n".encode())
         return digest.hexdigest()
@@ -88,6 +88,20 @@ class Step:
         """Remove what the command left, such as half of its results where it failed."""
         for path in self.outputs:
             path.unlink(missing_ok=True)
+
+
+def _files_below(folder: Path, outside: Path | None) -> list[Path]:
+    """Files of a folder, also behind links to folders, each folder once; without those in ``outside``."""
+    found: list[Path] = []
+    entered: set[Path] = set()
+    for place, folders, names in os.walk(folder, followlinks=True):
+        here = Path(place).resolve()
+        if here in entered or (outside is not None and here.is_relative_to(outside)):
+            folders.clear()
+            continue
+        entered.add(here)
+        found += [Path(place, name) for name in names]
+    return sorted(found)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -200,14 +200,20 @@ def draw_uncertainty(
 ) -> None:
     """Draw the standard deviation of one pixel by wavelength at some reflectances, and the white's part of it."""
     figure = new_figure(8.0, 4.5)
-    axes = figure.subplots()
+    axes, order = figure.subplots(), np.argsort(wavelengths_nm)
     colours = colormaps["viridis"](np.linspace(0.85, 0.0, len(REFLECTANCES)))
     for reflectance, colour in zip(REFLECTANCES, colours, strict=True):
         deviation = uncertainty.standard_deviation(np.full(len(wavelengths_nm), reflectance))
-        axes.plot(wavelengths_nm, deviation, color=colour, label=f"reflectance {reflectance:g}")
+        axes.plot(wavelengths_nm[order], deviation[order], color=colour, label=f"reflectance {reflectance:g}")
     brightest = max(REFLECTANCES)
     of_white = np.sqrt(uncertainty.quadratic) * brightest
-    axes.plot(wavelengths_nm, of_white, color="0.5", linestyle="--", label=f"the white's part at {brightest:g}")
+    axes.plot(
+        wavelengths_nm[order],
+        of_white[order],
+        color="0.5",
+        linestyle="--",
+        label=f"the white's part at {brightest:g}",
+    )
     axes.set(xlabel="wavelength (nm)", ylabel="standard deviation of one pixel's reflectance")
     logarithmic_axis(axes, "y")
     axes.set_title("Uncertainty of the reflectance")

@@ -118,7 +118,7 @@ def train_all(configurations: Sequence[Configuration], command: BenchmarkCommand
         else:
             _write([run for run in runs.values() if run], command, machine)
     finished = [run for run in runs.values() if run]
-    if not missing:
+    if finished and (failures or not missing):
         _write(finished, command, machine)
     if failures:
         raise InputError(f"{len(failures)} of {len(jobs)} configurations failed; the first: {failures[0]}")

@@ -136,6 +136,8 @@ class InspectCommand:
             InputError: the session cannot be used, or a finding is red.
         """
         console = Console()
+        if (self.watch or is_packed(self.session)) and (self.output_dir is not None or self.exclude):
+            raise InputError("--output-dir and --exclude are for a session without --watch; leave them out.")
         if self.watch:
             self._watch(console)
             return

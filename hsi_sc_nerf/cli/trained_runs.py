@@ -201,7 +201,9 @@ class RenderCommand:
             run = open_trained_run(self.load_config)
         material = None if self.material is None else read_material(self.material, run.dataset.wavelengths_nm)
         found = [find_false_colour(name, run.dataset.wavelengths_nm) for name in self.video]
-        shown = list({item.name: item for item in found}.values())  # a name may be given twice
+        shown = list({(item.name, item.legend): item for item in found}.values())  # a name may be given twice
+        if len({item.name for item in shown}) < len(shown):
+            raise InputError("two of --video have one name; give each formula a name of its own.")
         if self.camera_path is not None:
             views = views_of_path(self.camera_path)
         elif self.views == "orbit":

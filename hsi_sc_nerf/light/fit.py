@@ -69,6 +69,8 @@ COLOUR_STD = 0.1
 """Expected scatter of the lamps' colour from the white reference's light."""
 LEAST_LAMPS = 0.05
 """The lamps' colour is fitted if they give the white reference at least this fraction of its light."""
+LEAST_CHAMBER = 0.02
+"""Likewise the chamber, whose colour is what the lamps leave of the white's."""
 STEPS, LEAST_STEPS = 10, 3
 """Steps of Gauss-Newton for each number of lamps."""
 SETTLED = 0.01
@@ -275,7 +277,8 @@ class _LightFitting(MaterialFitting):
         """The colour of the lamps that fits each band best; the white reference stays white."""
         light = self.light
         of_chamber, of_lamps = light.on(self.white, self.white_m)
-        if of_lamps < LEAST_LAMPS * (of_chamber + of_lamps):
+        whole = of_chamber + of_lamps
+        if of_lamps < LEAST_LAMPS * whole or of_chamber < LEAST_CHAMBER * whole:
             return
         irradiance = self.irradiance()
         expected = self.materials(irradiance)[self.views.element] * irradiance

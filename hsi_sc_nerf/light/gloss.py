@@ -74,7 +74,9 @@ class Gloss:
         """
         highlight = self.highlight(normals)
         chamber = np.full(len(normals), self.reflectance * mirrored_chamber(light))
-        bands = chamber[:, None] * light.chamber_colour + highlight[:, None] * light.lamp_colour
+        # Of a whole cloud, these are its largest arrays.
+        bands = highlight.astype(np.float32)[:, None] * light.lamp_colour.astype(np.float32)
+        bands += chamber.astype(np.float32)[:, None] * light.chamber_colour.astype(np.float32)
         return bands, np.hypot(CHAMBER_ERROR * chamber, HIGHLIGHT_ERROR * highlight)
 
     def taken_off(

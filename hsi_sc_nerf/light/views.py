@@ -139,7 +139,7 @@ class TurningElements:
     """Elements that turn under light that is stationary in the camera's frame.
 
     Attributes:
-        positions: relative to the point at which the white reference was captured; metres, object frame.
+        positions: relative to the object's centre; metres, object frame.
         normals: outward unit normals, object frame.
         on_object: which of them belong to the object.
         transfer: how light reaches them.

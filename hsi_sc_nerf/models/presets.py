@@ -44,6 +44,9 @@ def apply_preset(config: Any) -> None:
     Args:
         config: of the trainer; changed in place, unless its preset is None. Settings that are no `PresetValue` stay.
 
+    Raises:
+        SystemExit: the configuration is that of the published method.
+
     Example:
         >>> config.preset = "fast"
         >>> apply_preset(config)
@@ -52,6 +55,11 @@ def apply_preset(config: Any) -> None:
     """
     if config.preset is None:
         return
+    if config.method_name == "hsi-sc-nerf-paper":
+        raise SystemExit(
+            "hsi-sc-nerf: --preset is for ns-train hsi-sc-nerf; the published method has its own length, which "
+            "--max-num-iterations changes."
+        )
     device: Device = "cuda" if config.machine.device_type == "cuda" else "cpu"
     for path, value in PRESETS[device][config.preset].items():
         parent, _, name = path.rpartition(".")

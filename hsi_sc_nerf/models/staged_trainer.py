@@ -118,8 +118,9 @@ class StagedTrainerConfig(TrainerConfig):
             require_data(self.pipeline.datamanager)
             resume_effects(self)
             make_folder(path.parent)
+            (saved := copy.copy(self)).load_step = None  # nerfstudio's evaluation takes it for the step to evaluate
             with atomic_write(path) as (temporary,):
-                temporary.write_text(yaml.dump(self), encoding="utf-8")
+                temporary.write_text(yaml.dump(saved), encoding="utf-8")
 
 
 class StagedTrainer(Trainer):
@@ -151,7 +152,6 @@ class StagedTrainer(Trainer):
         except SystemExit:
             discard_unbegun(self.base_dir)
             raise
-        self.config.load_step = None  # of this run, nerfstudio's evaluation takes it for the step to evaluate
         # Evaluation and export build what was trained, whatever becomes of the dataset.
         cast(SpectralModelConfig, (config := self.config).pipeline.model).effects = effects_setting(
             self._model.effects

@@ -110,7 +110,10 @@ def _some(pixels: tuple[Int[np.ndarray, "n 3"], ...]) -> list[Int[np.ndarray, "m
 
 def rim_brightness(sampler: PixelSampler, rim: Int[np.ndarray, "n 3"], deep: Int[np.ndarray, "n 3"]) -> float:
     """Median brightness of pixels of the rim relative to pixels further inside, one for each."""
-    at_rim, inside = (sampler.at(pixels)["spectral"].mean(axis=1) for pixels in (rim, deep))
+    batches = [sampler.at(pixels) for pixels in (rim, deep)]
+    spectra = [batch["spectral"] for batch in batches]
+    both = np.logical_and.reduce([batch.get("valid", np.ones(spectra[0].shape, bool)) for batch in batches])
+    at_rim, inside = ((part * both).sum(axis=1) for part in spectra)
     return float(np.median(at_rim / np.maximum(inside, 1e-6)))
 
 

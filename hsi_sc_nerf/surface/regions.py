@@ -10,10 +10,13 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
 from torch.nn import functional
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import read_picture
+from hsi_sc_nerf.findings import names_in_short
 from hsi_sc_nerf.packed.dataset import PackedFrame
 from hsi_sc_nerf.processing.visual_hull import silhouette_counts
 from hsi_sc_nerf.surface.depth_renders import DepthRenders
@@ -130,4 +133,8 @@ def read_roi_masks(
         raise InputError(
             f"{folder}: holds no mask of a training frame; name the pictures like {frames[0].mask_path.name}."
         )
+    used = {frames[index].mask_path.name for index in masks}
+    if unused := sorted(path.name for path in folder.glob("*.png") if path.name not in used):
+        names = escape(names_in_short(unused))
+        CONSOLE.print(f"[yellow]{escape(str(folder))}: not used, because they are of no training frame: {names}")
     return masks

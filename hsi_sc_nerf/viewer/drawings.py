@@ -35,9 +35,9 @@ def spectra_plot(
 ) -> bytes:
     """PNG of up to two named spectra over the wavelength; NaN leaves a gap."""
     figure = new_figure(_WIDTH_IN, 1.77)
-    axes = figure.add_subplot()
+    axes, order = figure.add_subplot(), np.argsort(wavelengths_nm)
     for (name, spectrum), colour in zip(spectra.items(), COLOURS, strict=False):
-        axes.plot(wavelengths_nm, spectrum, color=colour, linewidth=1.0, label=name)
+        axes.plot(wavelengths_nm[order], spectrum[order], color=colour, linewidth=1.0, label=name)
     axes.set(xlabel="Wavelength (nm)", ylabel="Reflectance", title=title)
     axes.set_xlim(wavelengths_nm.min(), wavelengths_nm.max())
     axes.set_ylim(0.0, max(0.1, 1.05 * max(float(np.nanmax(spectrum)) for spectrum in spectra.values())))

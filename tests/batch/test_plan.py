@@ -1,11 +1,12 @@
 """What a batch keeps of its plan, and one sentence for what it cannot be."""
 
+import shlex
 import shutil
 
 import pytest
 
 from hsi_sc_nerf.batch.plan import LIST_NAME, SETTINGS_NAME, read_plan, unlisted, write_plan
-from hsi_sc_nerf.batch.session_steps import SessionSettings
+from hsi_sc_nerf.batch.session_steps import STEPS_NAME, SessionSettings
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
 
@@ -49,6 +50,15 @@ def test_results_of_another_session_are_not_replaced(sessions):
     assert "moved" in (out / LIST_NAME).read_text()
     (out / "objects" / "pear").rmdir()
     plan(out, pear=friday)
+
+
+def test_results_are_guarded_also_after_another_list(sessions):
+    out, monday, friday = sessions
+    command = shlex.join(["hsi-sc-nerf", "inspect", str(monday)])
+    write_json(out / "objects" / "pear" / STEPS_NAME, {"inspect": {"command": command}})
+    plan(out, apple=friday)
+    with pytest.raises(InputError, match="pear: is of another session"):
+        plan(out, pear=friday)
 
 
 def test_objects_that_the_list_does_not_name_are_told(sessions):

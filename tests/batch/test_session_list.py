@@ -28,7 +28,12 @@ def table(tmp_path):
         "\ufeffsession\tobject\tday\na\tp1\t3\nb, c\tp2\t\n",
         "Object;SESSION;day;;\n;;;;\np1;a;3;;\np2;b, c;;;\n;;;;\n",
     ],
-    ids=["commas", "semicolons of Excel", "tabs with a byte order mark", "capitals, and empty columns and lines"],
+    ids=[
+        "commas",
+        "semicolons of Excel",
+        "tabs with a byte order mark",
+        "capitals, and empty columns and lines",
+    ],
 )
 def test_tables_of_spreadsheets_are_read(table, content):
     path = table(content)
@@ -43,6 +48,11 @@ def test_tables_of_spreadsheets_are_read(table, content):
     copy.write_text(sessions_table(rows))
     assert copy.read_text().startswith("object,session,day\n")
     assert read_sessions(copy) == rows
+
+
+@pytest.mark.parametrize("start", ['object;session;"mass, g, dry"\n', "\n\nobject;session;mass\n"])
+def test_the_separator_is_told_though_titles_hold_others_or_lines_are_empty(table, start):
+    assert read_sessions(table(f"{start}p1;a;3\n"))[0]["object"] == "p1"
 
 
 @pytest.mark.parametrize(

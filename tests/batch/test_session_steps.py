@@ -124,3 +124,12 @@ def test_moved_folders_are_the_same_and_other_captures_are_not(captures):
     (captures / "disk/pear_01/a.raw").write_text("another object")
     after = fingerprints("disk/pear_01", "disk/results")
     assert [name for name in before if before[name] != after[name]] == ["process"]
+
+
+def test_captures_behind_a_link_are_inputs_and_circles_end(captures):
+    (captures / "disk/two/capture").mkdir(parents=True)
+    (captures / "pear/two").symlink_to(captures / "disk/two")
+    (captures / "disk/two/round").symlink_to(captures / "pear")
+    before = fingerprints("pear", "out")
+    (captures / "disk/two/capture/two.raw").write_text("new")
+    assert fingerprints("pear", "out")["process"] != before["process"]

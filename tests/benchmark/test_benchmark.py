@@ -291,6 +291,15 @@ def test_a_failed_run_loses_only_itself(tiny_dataset, tmp_path, made_up):
     assert [r["name"] for r in json.loads((tmp_path / "benchmark.json").read_text())["runs"]] == ["no-normals"]
 
 
+def test_results_of_earlier_calls_are_written_though_all_that_is_left_fails(tiny_dataset, tmp_path, made_up):
+    command(tiny_dataset, tmp_path, configurations=()).main()
+    (tmp_path / "benchmark.json").unlink()
+    made_up.fails = ("training of ours",)
+    with pytest.raises(InputError, match="1 of 2 configurations failed"):
+        command(tiny_dataset, tmp_path).main()
+    assert [r["name"] for r in json.loads((tmp_path / "benchmark.json").read_text())["runs"]] == ["no-normals"]
+
+
 @pytest.mark.parametrize(
     "changes",
     [

@@ -290,3 +290,15 @@ def test_killed_and_started_again_it_loses_the_running_step_only(tmp_path, monke
     assert third.returncode == 0, told
     assert ran(tmp_path) == [f"pear {step}" for step in STEPS[2:]]
     assert statuses(tmp_path) == {"pear": ["done"] * 8}
+
+
+@pytest.mark.slow
+def test_columns_of_the_user_that_changed_stand_in_the_table(tmp_path, monkeypatch, command):
+    pytest.importorskip("snakemake")
+    make_sessions(tmp_path / "sessions", ["pear"])
+    monkeypatch.setattr(batch, "SNAKEFILE", quick_snakefile(tmp_path))
+    listed = tmp_path / "list.csv"
+    for genotype in ("A12", "B77"):
+        listed.write_text(f"object,session,genotype\npear,sessions/pear,{genotype}\n")
+        assert command("batch", listed, "--output-dir", tmp_path / "out", "--cores", "1") == 0
+        assert f",{genotype}," in (tmp_path / "out" / "traits.csv").read_text()

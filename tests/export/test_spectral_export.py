@@ -187,13 +187,15 @@ def test_clouds_that_cannot_be_written_are_refused_before_rendering(run, tmp_pat
 
 
 @pytest.mark.slow
-def test_a_painted_mask_keeps_what_its_frame_sees_in_it(run, tmp_path):
+def test_a_painted_mask_keeps_what_its_frame_sees_in_it(run, tmp_path, capsys):
     painted = np.zeros((LENS.h, LENS.w), np.uint8)
     painted[:, : LENS.w // 2] = 255
     (tmp_path / "roi").mkdir()
     cv2.imwrite(str(tmp_path / "roi" / "ball_003.png"), painted)
     options = CloudOptions(num_points=500, remove_outliers=False, roi_masks=tmp_path / "roi")
+    cv2.imwrite(str(tmp_path / "roi" / "nobody.png"), painted)
     points = run.to_scene(read_spectral_ply(export_cloud(run, tmp_path, options)).points)
+    assert "they are of no training frame: nobody.png" in " ".join(capsys.readouterr().out.split())
     xy_px, _ = project(points, POSES[3], LENS)
     assert len(points) == 500
     assert xy_px[:, 0].max() < LENS.w / 2 + 0.1

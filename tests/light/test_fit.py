@@ -173,3 +173,14 @@ def test_a_lamp_is_searched_for_where_its_shadow_lies(post_on_lid, monkeypatch, 
     used = views if shadow else replace(views, shows_light=views.on_object)
     to_lamp = fit_light(parts, used, FACING).light.to_lamps[0]
     assert least_deg < np.rad2deg(np.arccos(to_lamp @ TO_LAMP)) < most_deg
+
+
+@pytest.mark.parametrize("lamp", [0.985, 1.0])
+def test_a_dark_room_keeps_its_colours(ball, lamp):
+    views, irradiance, material = measured(ball, lamp, lamp_colour=(0.9, 1.1))
+    found = fit_light(ball, views, FACING)
+    best = np.zeros(len(ball.positions))
+    np.maximum.at(best, views.element, irradiance.mean(axis=1))
+    lit = seen_rows(views, ball) & (best > 0.3)
+    assert (found.light.chamber_colour >= 0.0).all()
+    assert np.quantile(np.abs((found.material / material)[lit] - 1.0), 0.95) < 0.03

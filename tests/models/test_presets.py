@@ -53,6 +53,13 @@ def test_better_presets_take_longer():
         assert presets["fast"][ITERATIONS] < presets["balanced"][ITERATIONS] < presets["best"][ITERATIONS]
 
 
+def test_the_published_method_takes_no_preset():
+    config = copy.deepcopy(hsi_sc_nerf_paper.config)
+    config.preset = "fast"
+    with pytest.raises(SystemExit, match="has its own length"):
+        apply_preset(config)
+
+
 def test_the_published_method_has_its_own_length():
     assert hsi_sc_nerf_paper.config.preset is None
     assert training_config("hsi-sc-nerf-paper", ()).max_num_iterations == sum(paper.STAGE_ITERATIONS)

@@ -2,6 +2,7 @@
 
 import copy
 import json
+import shutil
 
 import pytest
 import torch
@@ -223,7 +224,10 @@ def test_unusable_checkpoints_are_refused_in_a_sentence_and_leave_no_run(tiny_da
 def test_a_run_that_went_on_from_a_step_is_evaluated_at_its_last(tiny_dataset, tmp_path, whole):
     """nerfstudio's evaluation takes ``load_step`` of config.yml for the step to evaluate."""
     step = checkpoint(whole.checkpoint_dir)["step"]
-    made = longer(tiny_dataset, tmp_path, load_dir=whole.checkpoint_dir, load_step=step)
+    earlier = tmp_path / "earlier"
+    shutil.copytree(whole.checkpoint_dir, earlier)
+    (earlier / "step-000000099.ckpt").write_bytes(b"damaged")
+    made = longer(tiny_dataset, tmp_path, load_dir=earlier, load_step=step)
     assert made._start_step == step + 1
     saved = read_config(made.base_dir / "config.yml")
-    assert (saved.load_dir, saved.load_step) == (whole.checkpoint_dir, None)
+    assert (saved.load_dir, saved.load_step) == (earlier, None)

@@ -115,6 +115,8 @@ def test_process_keeps_the_decisions(tiny_dataset):
 
 def test_inspect_tells_them_of_a_dataset(tiny_dataset, tmp_path, capsys):
     InspectCommand(tiny_dataset[0]).main()
+    with pytest.raises(InputError, match="--output-dir and --exclude are for a session"):
+        InspectCommand(tiny_dataset[0], output_dir=tmp_path).main()
     shown = capsys.readouterr().out
     assert all(name in shown for name in NAMES.split())
     old = tmp_path / "old"

@@ -157,6 +157,12 @@ def test_what_cannot_be_rendered_is_refused_before_anything_is_loaded(tmp_path):
         RenderCommand(tmp_path / "config.yml", tmp_path, cubes="none").main()
 
 
+def test_two_formulas_of_one_name_are_refused(run, tmp_path):
+    video = ("X = R500/R600 [0, 2]", "X = R600/R500 [0, 9]")
+    with pytest.raises(InputError, match="two of --video have one name"):
+        RenderCommand(tmp_path, tmp_path / "out", cubes="none", video=video).main(run)
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, dataset):
     opened = open_trained_run(ball_run.write_untrained_run(dataset.root, tmp_path_factory.mktemp("runs")))

@@ -11,6 +11,7 @@ from hsi_sc_nerf.surface.outline_opacity import (
     half_coverage_opacity,
     outline_pixels,
     pixel_coverage,
+    rim_brightness,
 )
 
 SIDE, BANDS, RADIUS_PX = 64, 12, 20.0
@@ -105,3 +106,13 @@ def test_half_is_taken_where_the_rim_mirrors_the_chamber_or_is_in_the_shade(glos
 def test_an_implausible_opacity_is_bounded():
     found = half_coverage_opacity(sampler(), everywhere, lambda pixels: np.ones(len(pixels)))
     assert found == PLAUSIBLE_OPACITY[1]
+
+
+def test_saturated_values_inside_do_not_make_the_rim_brighter():
+    def at(pixels):
+        valid = np.ones((len(pixels), 10), bool)
+        valid[:, 0] = pixels[:, 0] == 0  # saturated inside
+        return {"spectral": 0.8 * valid, "valid": valid}
+
+    rim, deep = np.zeros((60, 3), int), np.ones((60, 3), int)
+    assert rim_brightness(SimpleNamespace(at=at), rim, deep) == pytest.approx(1.0)

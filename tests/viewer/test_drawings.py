@@ -59,3 +59,9 @@ def test_drawings_are_pictures_in_markdown():
     for png in (plot, colour_bar((0.0, 0.2), "magma", "angle")):
         assert png.startswith(b"\x89PNG")
         assert inline_image(png, "text").startswith("![text](data:image/png;base64,iVBOR")
+
+
+def test_bands_in_any_order_make_one_line():
+    nm, spectrum, order = np.linspace(400.0, 700.0, 4), np.array([0.1, 0.4, 0.3, 0.6]), np.array([2, 0, 3, 1])
+    shuffled = spectra_plot(nm[order], {"here": spectrum[order]}, "one")
+    assert shuffled == spectra_plot(nm, {"here": spectrum}, "one")
