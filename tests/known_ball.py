@@ -126,6 +126,7 @@ def known_run(folder) -> SimpleNamespace:
         model=BallModel(),
         dataset=SimpleNamespace(
             object_box_m=box_m,
+            metric=True,
             scene_box_m=box_m + np.array([[-0.03], [0.03]]),
             flagged_values=0,
             intrinsics=LENS,

@@ -68,7 +68,8 @@ def export_cloud(run: TrainedRun, output_dir: Path, options: CloudOptions, name:
     require_format(target, options.format, len(bands), len(EXTRA))
     cloud = render_cloud(run, options, name)
     path = write_cloud(target, cloud, options.format)
-    summary = f"{cloud.count:,} points with {len(bands)} bands, in metres: {escape(str(path))}"
+    unit = "metres" if run.dataset.metric else "distances of the camera (nothing gave the scale), not the file's m"
+    summary = f"{cloud.count:,} points with {len(bands)} bands, in {unit}: {escape(str(path))}"
     CONSOLE.print(f"[bold green]{summary}", soft_wrap=True)
     return path
 
