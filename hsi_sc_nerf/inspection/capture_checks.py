@@ -38,11 +38,11 @@ COMPARED_PX = 40
 FEWEST_COMPARED = 8
 """Fewest frames with which a different one can be recognised."""
 ACCURACY_BY_VIEWS = {
-    8: (2.1, 86, 0.7, 0),
-    12: (1.5, 96, 0.3, 8),
-    20: (1.2, 97, 0.2, 2),
-    30: (1.0, 98, 0.1, 3),
-    60: (0.9, 98, 0.2, 4),
+    8: (2.2, 86, 0.9, 1),
+    12: (1.5, 96, 0.5, 7),
+    20: (1.2, 97, 0.3, 2),
+    30: (1.0, 97, 0.4, 3),
+    60: (0.9, 98, 0.3, 2),
 }
 """Percent by number of views: root mean square error of the reflectance, F-score at 0.5 mm, error of the volume and
 of the area of a bruise (docs/validation/accuracy_and_time.md)."""
