@@ -19,9 +19,7 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
         options: further ones of ``numba.njit``.
 
     Example:
-        >>> @compiled
-        ... def add(a, b):
-        ...     return a + b
+        >>> add = compiled(lambda a, b: a + b)
         >>> add(1, 2)
         3
     """
