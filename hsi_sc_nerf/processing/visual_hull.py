@@ -96,6 +96,7 @@ def voted_hull(
     reach = distance * max(intrinsics.w / intrinsics.fl_x, intrinsics.h / intrinsics.fl_y) / 2.0
     low, high = centre - reach, centre + reach
     shown = masks.any(axis=(1, 2)) | (not masks.any())  # an empty mask does not tell where the object is
+    poses = camera_to_worlds[shown]
     for _ in range(2):
         sides = (high - low) / GRID_CELLS
         ticks = [low[k] + sides[k] * (np.arange(GRID_CELLS) + 0.5) for k in range(3)]
@@ -103,12 +104,12 @@ def voted_hull(
         if min_z_m is not None:
             points = points[points[:, 2] >= min_z_m - sides[2] / 2.0]
         voxel_px = 2 * int(np.ceil(intrinsics.fl_x * np.linalg.norm(sides) / 2.0 / distance)) + 1
-        dilated = np.stack([dilate(mask, voxel_px) for mask in masks])
-        voxels = visual_hull(points, dilated[shown], camera_to_worlds[shown], intrinsics, HULL_MISSED_FRACTION)
+        dilated = np.stack([dilate(mask, voxel_px) for mask in masks[shown]])
+        voxels = visual_hull(points, dilated, poses, intrinsics, HULL_MISSED_FRACTION)
         if len(voxels) == 0:
             break
         low, high = voxels.min(axis=0) - sides / 2.0, voxels.max(axis=0) + sides / 2.0
-    core = visual_hull(voxels, dilated[shown], camera_to_worlds[shown], intrinsics)
+    core = visual_hull(voxels, dilated, poses, intrinsics)
     silhouettes, core_silhouettes = (
         np.stack([_silhouette(seen, pose, intrinsics, voxel_px) for pose in camera_to_worlds])
         for seen in (voxels, core)
