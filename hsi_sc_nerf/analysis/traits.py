@@ -235,12 +235,8 @@ def _reflectance_std(
     """By how much frames disagree over the region's pixels, by what they mix, and by what is known of its light."""
     if pixel_m is None or math.isnan(noise):
         return math.nan
-    mixed = _mixed(surface, chosen, pixel_m)
-    if light is None:
-        return math.hypot(noise, mixed)
-    variance = noise**2 + (mixed / light.irradiance.mean) ** 2
-    variance += (spectrum.mean.mean() * light.irradiance_std / light.irradiance.mean) ** 2
-    return float(np.sqrt(variance))
+    shared = 0.0 if light is None else spectrum.mean.mean() * light.irradiance_std / light.irradiance.mean
+    return math.hypot(noise, _mixed(surface, chosen, pixel_m), shared)
 
 
 def _noise_std(

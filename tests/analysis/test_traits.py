@@ -167,15 +167,20 @@ def test_vertices_take_the_spectra_of_points_near_them():
     np.testing.assert_allclose(found.spectra[inside], surface.spectra[inside], rtol=1e-5)
 
 
-def test_a_region_at_the_edge_of_two_materials_is_uncertain_by_what_pixels_mix():
+@pytest.mark.parametrize("irradiance", [None, 0.5])
+def test_a_region_at_the_edge_of_two_materials_is_uncertain_by_what_pixels_mix(irradiance):
     surface = replace(two_halves(), scatter=np.zeros(len(two_halves().seen)))
+    surface.spectra[surface.mesh.vertices[:, 1] <= 0.0] *= 0.5
+    if irradiance is not None:
+        light = np.full(len(surface.seen), irradiance)
+        surface = replace(surface, lit=LitSpectra(surface.spectra * irradiance, light, 0.0 * light))
     spots = [
         RegionOfInterest(name, (x_m, y_m, 0.02), 0.003)
         for name, x_m, y_m in (("in", 0.0, 0.02), ("edge", 0.0198, 0.003))
     ]
     _, inside, edge = analyse(surface, spots, pixel_m=0.002).regions
     assert inside.reflectance_std == pytest.approx(0.0, abs=1e-6)
-    assert edge.reflectance_std > 0.02 * abs(GREEN.mean() - BROWN.mean())
+    assert edge.reflectance_std == pytest.approx(0.08 * (GREEN.mean() - 0.5 * BROWN.mean()), rel=0.02)
 
 
 def test_the_mean_of_a_region_scatters_as_its_pixels_and_shares_its_light():
