@@ -14,6 +14,7 @@ from hsi_sc_nerf.analysis.change_maps import BRIGHTNESS, SPECTRUM, Quantity, cha
 from hsi_sc_nerf.analysis.change_regions import GrownRegion, connected_to, grown_regions
 from hsi_sc_nerf.analysis.change_significance import FALSE_DISCOVERIES
 from hsi_sc_nerf.analysis.library import SpectralLibrary
+from hsi_sc_nerf.analysis.measurement import class_references
 from hsi_sc_nerf.analysis.traits import classified
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.indices.formula import SpectralIndex
@@ -92,6 +93,7 @@ def compare_days(
     """
     first, earlier = days[0], None
     mesh, areas_m2 = first.surface.mesh, first.surface.areas_m2
+    library = None if library is None else class_references(library, first.surface.wavelengths_nm)
     at_first = None if library is None else classified(first.surface, library, angle_rad)
     for before, after in pairwise(days):
         quantities = changes(first, after, bands_nm, indices, session_sd, repeat)

@@ -18,6 +18,7 @@ from hsi_sc_nerf.analysis.change_report import change_rows, write_change_ply, wr
 from hsi_sc_nerf.analysis.library import SpectralLibrary
 from hsi_sc_nerf.analysis.pictures import SideViews
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
+from hsi_sc_nerf.analysis.traits import WHOLE
 from hsi_sc_nerf.export.cloud import read_spectral_ply
 from hsi_sc_nerf.geometry.camera import Similarity
 from hsi_sc_nerf.geometry.mesh import Mesh
@@ -61,6 +62,13 @@ def test_an_index_that_the_typical_spectrum_has_not_is_compared_where_it_is_defi
     index = SpectralIndex("X", "sqrt(R500)")
     (told,) = compare_days([dark(0), dark(1)], (), [index], 0.01, repeat=dark(3))
     assert np.isfinite(told.quantities["X"].whole[1])
+
+
+def test_the_whole_surface_of_a_library_is_no_class_of_a_day(first):
+    """As in the regions.sli of `traits`, which a notebook hands over."""
+    library = SpectralLibrary((WHOLE, *LIBRARY.names), NM, np.vstack([SKIN, LIBRARY.spectra]))
+    (one,) = compare_days([first, day(1)], (), (), 0.01, library)
+    assert one.class_map.names == tuple(one.classes) == LIBRARY.names
 
 
 def rows_of(comparisons, kind, name="brightness"):
