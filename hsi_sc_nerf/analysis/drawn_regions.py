@@ -95,7 +95,7 @@ def write_drawn_regions(path: Path | str, regions: Sequence[DrawnRegion]) -> Non
     """Write regions on the same points, as the report's page saves them.
 
     Raises:
-        InputError: the file cannot be written.
+        InputError: there is no region, they lie on different points, or the file cannot be written.
 
     Example:
         >>> points_m = np.array([[0.0, 0.0, 0.01], [0.0, 0.0, 0.09]])
@@ -103,9 +103,14 @@ def write_drawn_regions(path: Path | str, regions: Sequence[DrawnRegion]) -> Non
         >>> read_drawn_regions("regions.json")[0].chosen
         array([False,  True])
     """
+    points = [one.points_m.round(6) for one in regions]
+    if not points or not all(
+        one.shape == points[0].shape and np.allclose(one, points[0], 0.0, 1e-5) for one in points
+    ):
+        raise InputError(f"{path}: takes regions that were drawn among the same points; write those of a page alone.")
     content = {
         "kind": KIND,
-        "points_m": regions[0].points_m.round(6).tolist(),
+        "points_m": points[0].tolist(),
         "regions": [{"name": one.name, "points": np.flatnonzero(one.chosen).tolist()} for one in regions],
     }
     with atomic_write(Path(path)) as (temporary,):

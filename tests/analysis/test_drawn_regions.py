@@ -9,6 +9,7 @@ from random_cloud import random_cloud
 
 from hsi_sc_nerf.analysis.drawn_regions import (
     KIND,
+    DrawnRegion,
     points_of_page,
     propose_regions,
     read_drawn_regions,
@@ -45,6 +46,14 @@ def test_area_and_spectrum_of_a_drawn_half_which_is_written_as_it_was_read(tmp_p
         assert one.name == again.name
         np.testing.assert_array_equal(one.chosen, again.chosen)
         np.testing.assert_allclose(one.points_m, again.points_m, atol=1e-6)
+
+
+@pytest.mark.parametrize("points_m", [None, np.zeros((3, 3)), np.ones((2, 3))], ids=["none", "more", "others"])
+def test_regions_on_different_points_are_not_written_as_if_they_were_on_the_same(tmp_path, points_m):
+    one = DrawnRegion("a", np.zeros((2, 3)), np.array([True, False]))
+    regions = [] if points_m is None else [one, DrawnRegion("b", points_m, np.arange(len(points_m)) > 0)]
+    with pytest.raises(InputError, match=r"regions\.json: takes regions that were drawn among the same points"):
+        write_drawn_regions(tmp_path / "regions.json", regions)
 
 
 def test_regions_of_another_object_and_unseen_ones_are_refused(tmp_path):
