@@ -105,7 +105,7 @@ class Lighting:
                 if factor.any():
                     of_surface += there.mix(surface.triangles, len(unit), fraction * factor) @ unit
             if of_lamps is not None:
-                of_surface += there.mix(surface.triangles, len(of_lamps), fraction) @ of_lamps
+                of_surface += there.mix(surface.triangles, len(of_lamps), fraction * lit.reflections) @ of_lamps
         light[:, chamber] = 1.0 - hits.mean(np.ones(len(hits.ray)))
         for i, (_, mirrored) in enumerate(at_hits.mirrored, start=len(self._light.colours)):
             light[:, i] = hits.mean(mirrored)
@@ -113,7 +113,8 @@ class Lighting:
 
     def _at_hits(self, hits: Hits, camera_to_world: Float[np.ndarray, "4 4"]) -> HitLight:
         count, chamber = len(hits.ray), len(self._renderer.materials) - 1
-        light = HitLight(np.ones(count, np.float32), np.zeros(count, np.float32), None, (chamber,))
+        ones = np.ones(count, np.float32)
+        light = HitLight(ones, np.zeros(count, np.float32), ones, None, (chamber,))
         for effect in self._on_view:
             light = effect.at_hits(hits, light, camera_to_world)
         return light
@@ -243,6 +244,7 @@ class HitLight:
     Attributes:
         chamber: factor on the light of the chamber.
         lamp: factor on the light of the lamp; includes its irradiance.
+        reflections: factor on the lamp's light that comes by way of other surfaces.
         to_lamp: unit direction to the lamp; None without a lamp.
         chamber_colour: colour of the chamber.
         mirrored: mirrored light at each hit and its colour.
@@ -251,6 +253,7 @@ class HitLight:
 
     chamber: Float[np.ndarray, "hits"]
     lamp: Float[np.ndarray, "hits"]
+    reflections: Float[np.ndarray, "hits"]
     to_lamp: Float[np.ndarray, "3"] | None
     chamber_colour: Colour
     mirrored: tuple[tuple[Colour, Float[np.ndarray, "hits"]], ...] = ()

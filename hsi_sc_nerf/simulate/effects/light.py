@@ -134,8 +134,8 @@ class Gloss(ViewLightEffect):
         reflectance = fresnel(cosine, self.refractive_index)
         mirror = 2.0 * cosine[:, None] * normals - to_camera
 
-        chamber, lamp, of_chamber = light.chamber.copy(), light.lamp.copy(), np.zeros_like(light.chamber)
-        chamber[glossy] *= 1.0 - reflectance
+        lamp, of_chamber, body = light.lamp.copy(), np.zeros_like(light.chamber), np.ones_like(light.chamber)
+        body[glossy] -= reflectance
         onwards, of_ray = hits.onwards(mirror, glossy), np.zeros(len(hits.directions), np.float32)
         of_ray[hits.ray[glossy]] = reflectance
         open_rays = np.isin(hits.ray[glossy], onwards.ray, invert=True)
@@ -150,8 +150,9 @@ class Gloss(ViewLightEffect):
             mirrored.append(((), highlight))
         return replace(
             light,
-            chamber=chamber,
+            chamber=light.chamber * body,
             lamp=lamp,
+            reflections=light.reflections * body,
             mirrored=(*light.mirrored, *mirrored),
             mirrored_hits=(onwards, of_ray[onwards.ray]),
         )

@@ -347,3 +347,15 @@ def test_gloss_dims_what_the_chamber_effects_give_and_mirrors_it(still_life, bak
     np.testing.assert_allclose(seen, expected, atol=2e-4)
     assert (expected[:, -1] > 0.0).any()
     assert (expected[:, : alone.shape[1]] > alone + 0.01).any()  # of the support
+
+
+def test_gloss_dims_the_light_of_a_lamp_that_comes_by_way_of_other_surfaces(still_life):
+    place, lit = look_at([0.35, 0.0, 0.25], [0.0, 0.0, 0.05]), [InterReflection(16), Lamp(1.0, azimuth_deg=120.0)]
+    hits = next(still_life.camera_hits(CAMERA, place, 1))[1]
+    alone, coated = (Lighting(still_life, [*lit, *coat]).light(hits, place)[0] for coat in ([], [Gloss()]))
+    cosine = -np.einsum("nk,nk->n", hits.facing_normals, hits.directions[hits.ray])
+    # In the lamp's shadow, and seen from so near to the front that it mirrors the chamber, which is dark.
+    some = hits.is_object & (hits.facing_normals @ lit[1].direction(place) < 0.0) & (cosine > 0.9)
+    seen, matte = (light[hits.pixel[some], : alone.shape[1]].sum(axis=1) for light in (coated, alone))
+    assert matte.max() > 0.01
+    np.testing.assert_allclose(seen, (1.0 - fresnel(cosine[some], 1.45)) * matte, rtol=1e-3)
