@@ -173,6 +173,7 @@ def test_command_writes_all_results(tmp_path, capsys):
         ({"splits": -1}, "--splits is -1"),
         ({"classes": ("bruise",)}, "give it with --library"),
         ({"mesh": MeshConfig(octree_depth=20)}, "octree-depth is 20"),
+        ({"mesh": MeshConfig(octree_depth=4)}, "octree-depth is 4"),
         ({"mesh": MeshConfig(smoothing_radius_m=0.0)}, "smoothing-radius-m is 0.0"),
         ({"angle_rad": 0.0}, "--angle-rad is 0.0"),
         ({"angle_rad": 10.0}, "--angle-rad is 10.0"),
