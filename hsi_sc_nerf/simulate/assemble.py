@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 
@@ -72,6 +71,7 @@ def frame_plan(scene: Scene) -> FramePlan:
         elapsed=np.linspace(0.0, 1.0, frames) if frames > 1 else np.zeros(1),
         nominal_step_deg=360.0 / frames,
         direction="ccw",
+        tilts=np.tile(np.eye(3), (frames, 1, 1)),
     )
     for effect in of_kind(scene.effects, MotionEffect):
         plan = effect.replan(plan, effect_rng(scene.seed, effect))
@@ -227,8 +227,8 @@ def plaque_back(frame: MarkerFrame, markers: MarkerSettings) -> Mesh:
     return quads(corners[None])
 
 
-def aruco_dictionary(markers: MarkerSettings) -> cv2.aruco.Dictionary:
-    """OpenCV's dictionary of the markers.
+def paper_side_in_markers(markers: MarkerSettings) -> float:
+    """Ratio of the side of a marker's paper to that of its black square.
 
     Raises:
         InputError: OpenCV has no such dictionary, or it has too few markers.
@@ -238,12 +238,7 @@ def aruco_dictionary(markers: MarkerSettings) -> cv2.aruco.Dictionary:
         raise InputError(
             f"{markers.dictionary} has only {len(dictionary.bytesList)} markers; use fewer or a larger dictionary."
         )
-    return dictionary
-
-
-def paper_side_in_markers(markers: MarkerSettings) -> float:
-    """Ratio of the side of a marker's paper to that of its black square."""
-    return 1.0 + 2.0 * QUIET_ZONE_MODULES / (aruco_dictionary(markers).markerSize + 2)
+    return 1.0 + 2.0 * QUIET_ZONE_MODULES / (dictionary.markerSize + 2)
 
 
 def _to_object_frame(in_plane: Float[np.ndarray, "*n 2"], frame: MarkerFrame, side_m: float) -> np.ndarray:

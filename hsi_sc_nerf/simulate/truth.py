@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -76,12 +76,11 @@ class Truth:
 
     def light(self, capture: str) -> Light:
         """Noise-free light on the sensor, rotated as the counts are; `Light.radiance` gives an image."""
-        path = pixels_path(self.session_dir, capture)
-        arrays = _read_arrays(path)
+        arrays = _read_arrays(pixels_path(self.session_dir, capture))
         factors = [name for name in arrays if name.startswith("illumination_")]
-        weights = _one_of(path, arrays, "light_weights" if "light_weights" in arrays else "material_weights")
+        weights = arrays.get("light_weights")
         return Light(
-            weights=weights.astype(np.float32),
+            weights=self.material_weights(capture) if weights is None else weights.astype(np.float32),
             spectra=arrays.get("light_spectra", self.endmembers),
             illumination=tuple(arrays[name] for name in sorted(factors)),
         )
@@ -97,7 +96,9 @@ class Truth:
     def _pixels(self, capture: str, key: str, each: tuple[int, ...] = ()) -> np.ndarray:
         """An image whose pixels have the shape ``each``."""
         path = pixels_path(self.session_dir, capture)
-        image = _one_of(path, _read_arrays(path, (key,)), key)
+        image = _read_arrays(path, (key,)).get(key)
+        if image is None:
+            raise InputError(f"{path}: holds no {key}; simulate the session again.")
         if image.shape[2:] != each or image.ndim < 2:
             raise InputError(f"{path}: its {key} is not an image of the session; simulate the session again.")
         return image
@@ -227,12 +228,6 @@ def _read_arrays(path: Path, only: Collection[str] = ()) -> dict[str, np.ndarray
         return found
     except Exception as error:  # what readers of damaged archives raise has no common class
         raise InputError(f"{path}: cannot be read ({error}); simulate the session again.") from error
-
-
-def _one_of(path: Path, arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
-    if name not in arrays:
-        raise InputError(f"{path}: holds no {name}; simulate the session again.")
-    return arrays[name]
 
 
 def write_true_mesh(path: Path, part: Part) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.geometry.camera import unit_vectors
+from hsi_sc_nerf.geometry.mesh import unoccluded
 from hsi_sc_nerf.settings_file import between
 from hsi_sc_nerf.simulate.effect import Effect
 from hsi_sc_nerf.simulate.light import HitLight, Reflection, SurfaceLight, SurfaceLightEffect, ViewLightEffect
@@ -100,7 +101,8 @@ class Lamp(ViewLightEffect):
         to_lamp, normals = self.direction(camera_to_world), surface.mesh.vertex_normals()
         cosine = np.maximum(normals @ to_lamp, 0.0)
         starts = surface.mesh.vertices + RAY_START_M * normals
-        return self.fraction * cosine * surface.renderer.is_unoccluded(starts, np.broadcast_to(to_lamp, starts.shape))
+        is_lit = unoccluded(surface.renderer.scene, starts, np.broadcast_to(to_lamp, starts.shape))
+        return self.fraction * cosine * is_lit
 
     def direction(self, camera_to_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "3"]:
         """Unit vector from the object to the lamp, object frame."""

@@ -24,7 +24,7 @@ class FramePlan:
         elapsed: time of each frame as a fraction of the session, in [0, 1].
         nominal_step_deg: step as the operator states it in ``session.json``, positive.
         direction: direction of rotation as the operator states it, seen from above.
-        tilts: rotation of the turntable axis in each frame; None if the axis does not move.
+        tilts: rotation of the turntable axis in each frame.
     """
 
     room_camera: Float[np.ndarray, "4 4"]
@@ -32,7 +32,7 @@ class FramePlan:
     elapsed: Float[np.ndarray, "n"]
     nominal_step_deg: float
     direction: Literal["ccw", "cw"]
-    tilts: Float[np.ndarray, "n 3 3"] | None = None
+    tilts: Float[np.ndarray, "n 3 3"]
 
     @property
     def camera_to_world(self) -> Float[np.ndarray, "n 4 4"]:
@@ -41,23 +41,14 @@ class FramePlan:
         A point X of the object is at ``tilt Rot(z, angle) X`` in the room; the camera pose is transformed by the
         inverse.
         """
-        poses = []
-        for i, angle in enumerate(self.angles_deg):
-            camera = self.room_camera
-            if self.tilts is not None:
-                camera = camera.copy()
-                camera[:3] = self.tilts[i].T @ camera[:3]
-            poses.append(turntable_camera_to_world(camera, angle))
-        return np.stack(poses)
+        cameras = np.tile(self.room_camera, (len(self.angles_deg), 1, 1))
+        cameras[:, :3] = self.tilts.swapaxes(1, 2) @ cameras[:, :3]
+        return np.stack([turntable_camera_to_world(*one) for one in zip(cameras, self.angles_deg, strict=True)])
 
     def select(self, frames: np.ndarray) -> FramePlan:
         """The plan of the given frame indices, in that order, with their times."""
-        return replace(
-            self,
-            angles_deg=self.angles_deg[frames],
-            elapsed=self.elapsed[frames],
-            tilts=None if self.tilts is None else self.tilts[frames],
-        )
+        of_frames = {name: getattr(self, name)[frames] for name in ("angles_deg", "elapsed", "tilts")}
+        return replace(self, **of_frames)
 
 
 class MotionEffect(Effect):
@@ -142,8 +133,8 @@ class Wobble(MotionEffect):
 
     def replan(self, plan: FramePlan, rng: np.random.Generator) -> FramePlan:
         """Tilt the axis in each frame."""
-        tilts = np.stack([_tilt(self.amplitude_deg, self.cycles_per_turn * a) for a in plan.angles_deg])
-        return replace(plan, tilts=tilts if plan.tilts is None else tilts @ plan.tilts)
+        tilts = [_tilt(self.amplitude_deg, self.cycles_per_turn * angle) for angle in plan.angles_deg]
+        return replace(plan, tilts=np.stack(tilts))
 
 
 @dataclass(frozen=True)
