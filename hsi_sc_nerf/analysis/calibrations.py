@@ -182,7 +182,6 @@ def calibration_map(surface: SpectralMesh, calibration: Calibration) -> SurfaceM
         values,
         of,
         calibration.error,
-        unit=calibration.unit,
         resampling_error=resampling_error,
         limited=calibration.domain is not None,
     )

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+from trimesh.graph import connected_component_labels
 
 from hsi_sc_nerf.analysis.change_noise import PATCH_M
 from hsi_sc_nerf.analysis.change_significance import Patches
@@ -221,10 +220,9 @@ def _touching(
     fell = (change[some, 0] < 0.0) & (change.shape[1] == 1)
     pairs = cKDTree(patches.centres_m[some]).query_pairs(_GAP * PATCH_M, output_type="ndarray") if len(some) else some
     pairs = pairs.reshape(-1, 2)
-    start, end = pairs[fell[pairs[:, 0]] == fell[pairs[:, 1]]].T
-    linked = csr_array((np.ones(len(start)), (start, end)), shape=(len(some),) * 2)
-    count, group = connected_components(linked, directed=False)
-    return [some[group == number] for number in range(count)]
+    linked = pairs[fell[pairs[:, 0]] == fell[pairs[:, 1]]]
+    group = connected_component_labels(linked, node_count=len(some))
+    return [some[group == number] for number in np.unique(group)]
 
 
 def _pieces(mesh: Mesh, inside: Bool[np.ndarray, "v"]) -> list[Int[np.ndarray, "piece"]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -12,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from hsi_sc_nerf.analysis.calibrations import Calibration
 from hsi_sc_nerf.analysis.classes import UNCLASSIFIED, class_areas_m2
+from hsi_sc_nerf.analysis.maps import column_of
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
 
 OUTSIDE = "outside of what the classifier knows"
@@ -49,7 +49,7 @@ class ClassMap:
     @property
     def column(self) -> str:
         """Its column in a cloud, as `SurfaceMap.column`."""
-        return f"calibration_{re.sub(r'[^A-Za-z0-9]+', '_', self.name)}"
+        return column_of("calibration", self.name)
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,6 @@ class SurfaceMap:
         of: computes the numbers of spectra at the surface's bands.
         error: standard deviation that all values share; 0 for none.
         definition: words that find the index again; empty for other maps.
-        unit: unit of the values; empty for none.
         resampling_error: root mean square of what resampling the spectra changes.
         limited: of a calibration, whether it tells which spectra it was fitted on.
     """
@@ -43,7 +42,6 @@ class SurfaceMap:
     of: Callable[[Float[np.ndarray, "n bands"]], Float[np.ndarray, "n"]]
     error: float = 0.0
     definition: str = ""
-    unit: str = ""
     resampling_error: float = 0.0
     limited: bool = False
 
@@ -55,9 +53,13 @@ class SurfaceMap:
 
     @property
     def column(self) -> str:
-        """Its column in a cloud: ``index_`` or ``calibration_``, and the name with ``_`` for all but letters."""
-        kind = "index" if self.definition else "calibration"
-        return f"{kind}_{re.sub(r'[^A-Za-z0-9]+', '_', self.name)}"
+        """Its column in a cloud."""
+        return column_of("index" if self.definition else "calibration", self.name)
+
+
+def column_of(kind: str, name: str) -> str:
+    """Column of a cloud for a map: ``index_`` or ``calibration_``, and its name with ``_`` for all but letters."""
+    return f"{kind}_{re.sub(r'[^A-Za-z0-9]+', '_', name)}"
 
 
 def require_own_names(names: Sequence[str]) -> None:

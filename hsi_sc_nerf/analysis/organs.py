@@ -8,9 +8,8 @@ from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+from trimesh.graph import connected_component_labels
 
 from hsi_sc_nerf.analysis.spectral_edges import GAP, LARGEST, LEAST_POINTS, Edge, beside, rings, sharpest_edge
 from hsi_sc_nerf.analysis.spectral_mesh import NEIGHBOURS
@@ -253,8 +252,7 @@ def _slim_length(
 def _largest_piece(chosen: Bool[np.ndarray, "n"], near: Int[np.ndarray, "n near"]) -> Bool[np.ndarray, "n"]:
     start, end = np.repeat(np.arange(len(near)), near.shape[1]), near.ravel()
     linked = chosen[start] & chosen[end]
-    graph = csr_array((np.ones(linked.sum()), (start[linked], end[linked])), shape=(len(near),) * 2)
-    piece = connected_components(graph, directed=False)[1]
+    piece = connected_component_labels(np.stack([start[linked], end[linked]], axis=1), node_count=len(near))
     return chosen & (piece == np.bincount(piece[chosen]).argmax()) if chosen.any() else chosen
 
 

@@ -80,7 +80,7 @@ def trait_content(
         "seen_area_m2": traits.seen_m2,
         "indices": [one.definition for one in traits.maps if one.definition],
         "calibrations": {
-            one.name: {"unit": one.unit, "error": one.error} | _bounds(one)
+            one.name: {"unit": one.label, "error": one.error} | _bounds(one)
             for one in traits.maps
             if not one.definition
         },

@@ -300,11 +300,7 @@ def weighted_mean_and_sd(values: Float[np.ndarray, "n *rest"], weights: Float[np
         return MeanAndSd(mean, np.sqrt((weight * np.square(known - mean)).sum(axis=0)))
 
 
-def classified(
-    surface: SpectralMesh,
-    library: SpectralLibrary,
-    threshold_rad: float,
-) -> Classes:
+def classified(surface: SpectralMesh, library: SpectralLibrary, threshold_rad: float) -> Classes:
     """Classify the seen vertices against a library, brought to the surface's bands.
 
     Library spectra of one name are references of one class. By angle, a vertex belongs to the class of the reference

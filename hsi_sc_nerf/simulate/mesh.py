@@ -6,9 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+from trimesh.graph import connected_component_labels
 
 from hsi_sc_nerf.geometry.mesh import Mesh
 
@@ -90,8 +89,7 @@ def quads(corners: Float[np.ndarray, "q 4 3"]) -> Mesh:
 def snapped(vertices: Float[np.ndarray, "v 3"], tolerance_m: float) -> Float[np.ndarray, "v 3"]:
     """Vertices within ``tolerance_m`` of each other get the position of the first of them."""
     near = cKDTree(vertices).query_pairs(tolerance_m, output_type="ndarray")
-    n = len(vertices)
-    _, group = connected_components(csr_array((np.ones(len(near)), near.T), shape=(n, n)), directed=False)
+    group = connected_component_labels(near, node_count=len(vertices))
     _, first = np.unique(group, return_index=True)
     return vertices[first[group]]
 

@@ -9,7 +9,6 @@ import numpy as np
 import scipy.sparse
 import trimesh
 from jaxtyping import Bool, Float, Int
-from scipy.sparse.csgraph import connected_components
 
 from hsi_sc_nerf.geometry.camera import GOLDEN_ANGLE, unit_vectors
 from hsi_sc_nerf.geometry.mesh import Mesh
@@ -124,9 +123,8 @@ def split_at_creases(
         (3 * face + (triangles[face] == edges[smooth].T[..., None]).argmax(axis=-1)).ravel()
         for face in faces[smooth].T
     )
-    joined = scipy.sparse.coo_array((np.ones(len(one), np.int8), (one, other)), shape=(triangles.size,) * 2)
-    points, point = connected_components(joined, directed=False)
-    vertex = np.empty(points, np.int64)
+    point = trimesh.graph.connected_component_labels(np.stack([one, other], axis=1), node_count=triangles.size)
+    vertex = np.empty(point.max() + 1, np.int64)
     vertex[point] = triangles.ravel()
     return point.reshape(-1, 3), vertex
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from hsi_sc_nerf.analysis.classes import spectral_angles
 from hsi_sc_nerf.analysis.components import find_components, purest_spectra
 from hsi_sc_nerf.analysis.spectral_mesh import SpectralMesh
-from hsi_sc_nerf.numerics import spectral_angle
 from hsi_sc_nerf.simulate.mesh import cylinder
 
 NM = np.linspace(400.0, 1000.0, 31)
@@ -53,19 +53,12 @@ def test_a_surface_has_as_many_components_as_materials_and_no_more(scatter):
     surface, fractions = surface_of(0.001, scatter)
     found = find_components(surface, 8)
     assert found.supported == 3
-    angles = [[float(spectral_angle(*map(_tensor, (a, b)))) for a in found.endmembers.spectra] for b in PURE]
-    order = np.argmin(angles, axis=1)
+    order = spectral_angles(PURE, found.endmembers.spectra).argmin(axis=1)
     assert set(order) == {0, 1, 2}
     np.testing.assert_allclose(found.fractions[surface.seen][:, order], _scaled(fractions)[surface.seen], atol=0.06)
     assert np.isnan(found.fractions[~surface.seen]).all()
     assert np.isnan(found.scores[~surface.seen]).all()
     assert find_components(surface, 2).scores.shape[1] == 2
-
-
-def _tensor(values):
-    import torch
-
-    return torch.from_numpy(np.asarray(values, np.float32))
 
 
 def _scaled(fractions):

@@ -124,9 +124,7 @@ def test_tables_and_json_hold_maps():
     surface = two_halves()
     maps = index_maps(surface, find_indices(["NDVI"], NM))
     half = np.where(surface.mesh.vertices[:, 1] > 0.0, 12.0, np.nan)
-    maps.append(
-        SurfaceMap("sugar", "°Brix", half, lambda spectra: spectra[:, 0], 0.4, "", "°Brix", 0.03, limited=True)
-    )
+    maps.append(SurfaceMap("sugar", "°Brix", half, lambda spectra: spectra[:, 0], 0.4, "", 0.03, limited=True))
     traits = analyse(surface, maps=maps)
     content = report.trait_content(Size(*[1.0] * 6), {}, True, traits, {})
     assert content["indices"] == ["NDVI = (R800 - R670) / (R800 + R670) [0, 1]"]
