@@ -91,6 +91,8 @@ def with_spectra(
     known, material = np.isfinite(cloud.spectra).all(axis=1), material_spectra(cloud)
     if not known.any():
         raise InputError("no point of the cloud has a spectrum; export the cloud again.")
+    if not set(LIGHT_COLUMNS) <= set(cloud.extra):
+        material = None
     if material is not None:
         known &= np.isfinite(material).all(axis=1)
     if not known.any():

@@ -272,12 +272,9 @@ def band_property_names(wavelengths_nm: Float[np.ndarray, "bands"], kind: str = 
 
 
 def material_spectra(cloud: SpectralCloud) -> Float[np.ndarray, "n bands"] | None:
-    """Reflectance of the material, from the columns that `hsi-sc-nerf material` adds; None without all of them, those
-    of the light as well."""
+    """Reflectance of the material, from the columns that `hsi-sc-nerf material` adds; None without all of them."""
     names = material_names(cloud.wavelengths_nm, cloud.extra)
-    if not (names and set(LIGHT_COLUMNS) <= set(cloud.extra)):
-        return None
-    return np.stack([cloud.extra[name] for name in names], axis=1)
+    return np.stack([cloud.extra[name] for name in names], axis=1) if names else None
 
 
 def material_names(wavelengths_nm: Float[np.ndarray, "bands"], extra_names: Iterable[str]) -> list[str]:

@@ -129,7 +129,7 @@ def read_material(path: Path, wavelengths_nm: Float[np.ndarray, "bands"]) -> Clo
     if not same or not np.allclose(cloud.wavelengths_nm, wavelengths_nm, atol=SAME_BAND_NM):
         raise InputError(f"{path}: its bands are not those of the run; take the cloud of the same run.")
     spectra = material_spectra(cloud)
-    if spectra is None:
+    if spectra is None or not set(LIGHT_COLUMNS) <= set(cloud.extra):
         raise InputError(f"{path}: has no columns of the material; take the cloud by `hsi-sc-nerf material`.")
     known = np.isfinite(spectra).all(axis=1)
     if not known.any():
