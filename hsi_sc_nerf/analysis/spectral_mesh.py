@@ -33,7 +33,7 @@ class LitSpectra:
 
     Attributes:
         measured: relative to the white reference at its place.
-        irradiance: relative to that on the white reference, mean over bands.
+        irradiance: relative to that on the white reference, mean over bands; NaN if the cloud has lost it.
         irradiance_std: its standard deviation; NaN where it is not known.
     """
 
@@ -91,8 +91,6 @@ def with_spectra(
     known, material = np.isfinite(cloud.spectra).all(axis=1), material_spectra(cloud)
     if not known.any():
         raise InputError("no point of the cloud has a spectrum; export the cloud again.")
-    if not set(LIGHT_COLUMNS) <= set(cloud.extra):
-        material = None
     if material is not None:
         known &= np.isfinite(material).all(axis=1)
     if not known.any():
@@ -117,7 +115,8 @@ def with_spectra(
 
     spectra, lit, scatter = mean(cloud.spectra), None, None
     if material is not None:
-        light = mean(np.stack([cloud.extra[name] for name in LIGHT_COLUMNS], axis=1))
+        none = np.full(len(cloud), np.nan)
+        light = mean(np.stack([cloud.extra.get(name, none) for name in LIGHT_COLUMNS], axis=1))
         spectra, lit = mean(material), LitSpectra(spectra, *light.T)
     if {"views", "spectral_std"} <= set(cloud.extra):
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -228,6 +228,22 @@ def test_a_cloud_by_material_gives_both_reflectances(tmp_path):
     assert titles[5:9] == ["low material mean", "low material SD", "low measured mean", "low measured SD"]
 
 
+def test_a_cloud_that_has_lost_its_irradiance_is_one_of_the_material_all_the_same():
+    """As CloudCompare saves it if that field was not chosen; what follows from the light is not known then."""
+    surface = two_halves()
+    cloud = shaded_cloud(surface)
+    del cloud.extra["irradiance"]
+    whole, lost = (with_spectra(surface.mesh, one, seen_within_m=0.001) for one in (shaded_cloud(surface), cloud))
+    np.testing.assert_array_equal(lost.spectra, whole.spectra)
+    np.testing.assert_array_equal(lost.lit.measured, whole.lit.measured)
+    traits = analyse(replace(lost, scatter=np.full(len(lost.seen), 0.01)), pixel_m=0.001)
+    assert np.isnan([traits.regions[0].light.irradiance.mean, traits.regions[0].reflectance_std]).all()
+    content = report.trait_content(Size(*[1.0] * 6), {}, True, traits, {})
+    assert content["regions"][WHOLE]["reflectance"]["irradiance"] is None
+    (row,) = (row for table in trait_tables(content) if table.heading == "Reflectance" for row in table.rows)
+    assert row[-1].startswith("nan")
+
+
 def test_points_whose_material_is_not_known_give_no_spectrum():
     """As `sample --material` leaves them further than 3 mm from the material's cloud."""
     surface = two_halves()
