@@ -182,14 +182,13 @@ def grown_regions(
     areas_m2: Float[np.ndarray, "v"],
     before: Bool[np.ndarray, "v"],
     after: Bool[np.ndarray, "v"],
-    smallest_m2: float = SMALLEST_REGION_M2,
 ) -> list[GrownRegion]:
     """Areas of the regions that have a property before or after; what overlaps is one region. The largest first.
 
     Example:
         >>> square = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
         >>> one = np.array([True, False, False, False])
-        >>> [(r.before_m2, r.after_m2) for r in grown_regions(square, np.full(4, 0.25), one, np.ones(4, bool), 0.1)]
+        >>> [(r.before_m2, r.after_m2) for r in grown_regions(square, np.full(4, 0.25), one, np.ones(4, bool))]
         [(0.25, 1.0)]
     """
     regions = [
@@ -201,7 +200,7 @@ def grown_regions(
         for piece in _pieces(mesh, before | after)
     ]
     return sorted(
-        (one for one in regions if max(one.before_m2, one.after_m2) >= smallest_m2),
+        (one for one in regions if max(one.before_m2, one.after_m2) >= SMALLEST_REGION_M2),
         key=lambda one: -max(one.before_m2, one.after_m2),
     )
 

@@ -59,12 +59,11 @@ def measure_pieces(
             cloud, dataset, mesh=config, regions=regions, drawn_regions=drawn_regions, piece=piece, **settings
         )
         return [alone]
-    trees = [cKDTree(cloud.points[rows]) for rows in pieces]
+    tree, rows_of = cKDTree(cloud.points), [set(rows.tolist()) for rows in pieces]
 
     def hold(number: int, points_m: Float[np.ndarray, "n 3"]) -> bool:
         """Whether the object is the nearest to one of the points."""
-        distances_m = [tree.query(points_m)[0] for tree in trees]
-        return bool((np.argmin(distances_m, axis=0) == number).any())
+        return not rows_of[number].isdisjoint(tree.query(points_m)[1].tolist())
 
     return [
         measure_traits(

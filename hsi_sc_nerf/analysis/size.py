@@ -5,6 +5,7 @@ Uncertainty comes from the scatter of single points, and from what all points ha
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass, replace
@@ -113,7 +114,7 @@ def size_uncertainty(
     config: MeshConfig,
     splits: int,
     systematic: SystematicErrors | None = None,
-    done: Callable[[int], None] | None = None,
+    done: Callable[[int], object] = int,
 ) -> dict[str, Size]:
     """Standard deviation of each size by its cause; the causes are independent.
 
@@ -136,13 +137,10 @@ def size_uncertainty(
         0.0021
     """
     config = replace(config, octree_depth=min(config.octree_depth, VARIED_DEPTH))
-    finished = 0
+    finished = itertools.count(1)
 
     def size(varied: Mesh) -> np.ndarray:
-        nonlocal finished
-        finished += 1
-        if done is not None:
-            done(finished)
+        done(next(finished))
         return np.array(astuple(size_of(varied)))
 
     parts: dict[str, np.ndarray] = {}

@@ -128,7 +128,11 @@ def support_parts(scene: Scene, spacing_m: float | None = None) -> list[Part]:
     for number, frame in (on_container | on_disc).items():
         mesh, ink = marker_mesh(frame, number, scene.markers)
         parts.append(Part(mesh, ("paper", "marker_ink"), np.stack([~ink, ink], axis=-1).astype(float)))
-    parts += [_plain(plaque_back(frame, scene.markers), "paper") for frame in on_container.values()]
+    for centre, u, v in on_container.values():
+        # The back of a plaque makes the paper opaque.
+        behind = centre - PLAQUE_THICKNESS_M * np.cross(u, v), u, v
+        corners = UNIT_CORNERS * paper_side_in_markers(scene.markers)
+        parts.append(_plain(quads(_to_object_frame(corners, behind, scene.markers.side_m)[None]), "paper"))
     return [replace(part, mesh=part.mesh.moved(_offset_m(scene))) for part in parts]
 
 
@@ -217,14 +221,6 @@ def marker_mesh(frame: MarkerFrame, number: int, markers: MarkerSettings) -> tup
     corners = [(left, bottom), (right, bottom), (right, top), (left, top)]
     in_plane = np.stack([np.stack(corner, axis=-1) for corner in corners], axis=2).reshape(-1, 4, 2)
     return quads(_to_object_frame(in_plane, frame, markers.side_m)), np.repeat(ink.ravel(), 4)
-
-
-def plaque_back(frame: MarkerFrame, markers: MarkerSettings) -> Mesh:
-    """The back of a plaque, which makes the paper opaque."""
-    centre, u, v = frame
-    behind = (centre - PLAQUE_THICKNESS_M * np.cross(u, v), u, v)
-    corners = _to_object_frame(UNIT_CORNERS * paper_side_in_markers(markers), behind, markers.side_m)
-    return quads(corners[None])
 
 
 def paper_side_in_markers(markers: MarkerSettings) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -21,18 +20,10 @@ COVER_DISTANCE_M, COVER_FRACTION = 0.001, 0.6
 """A point is covered if this fraction of its rays hits a back face or, on the support, hits within the distance."""
 
 
-@dataclass(frozen=True)
-class Surroundings:
-    """What is visible from the points of a surface, weighted by the cosine to the normal.
-
-    Attributes:
-        chamber_visibility: fraction of directions in which nothing occludes the chamber, in [0, 1].
-        form_factors: fraction of each point of the surface (column) in the view of each point (row), without back
-            faces.
-    """
-
-    chamber_visibility: Float[np.ndarray, "p"]
-    form_factors: scipy.sparse.csr_array
+Surroundings = tuple[Float[np.ndarray, "p"], scipy.sparse.csr_array]
+"""What is visible from the points of a surface, weighted by the cosine to the normal: the fraction of directions in
+which nothing occludes the chamber, in [0, 1]; and the form factors, the fraction of each point of the surface
+(column) in the view of each point (row), without back faces."""
 
 
 class SceneSurface:
@@ -86,9 +77,7 @@ class SceneSurface:
             )
             factors.append(hits.mix(self.triangles, points, (~hits.is_back_face).astype(np.float32)))
         uncover = self._from_uncovered_neighbours(covered)
-        return Surroundings(
-            uncover @ visibility, scipy.sparse.csr_array(uncover @ scipy.sparse.vstack(factors, format="csr"))
-        )
+        return uncover @ visibility, scipy.sparse.csr_array(uncover @ scipy.sparse.vstack(factors, format="csr"))
 
     def _from_uncovered_neighbours(self, covered: Bool[np.ndarray, "p"]) -> scipy.sparse.csr_array:
         """Matrix that replaces the value of a covered point by the mean of its uncovered neighbours.

@@ -25,6 +25,7 @@ from hsi_sc_nerf.simulate.frames import SimulatedFrame, Simulation
 from hsi_sc_nerf.simulate.light import Light
 from hsi_sc_nerf.simulate.render import Part
 
+DETECTOR = "detector.npz"
 COVERED = 0.5
 """Fraction of a pixel that the object covers, from which on the pixel is the object's."""
 
@@ -90,7 +91,7 @@ class Truth:
 
         Maps of effects that the scene does not name are missing.
         """
-        path = detector_path(self.session_dir)
+        path = self.session_dir / "truth" / DETECTOR
         return _read_arrays(path) if path.exists() else {}
 
     def _pixels(self, capture: str, key: str, each: tuple[int, ...] = ()) -> np.ndarray:
@@ -173,11 +174,9 @@ def write_truth(session_dir: Path, simulation: Simulation) -> None:
         table.writerow(["wavelength_nm", *materials])
         table.writerows(np.column_stack([wavelengths_nm, simulation.endmembers.T]).tolist())
     write_true_mesh(folder / "mesh.ply", simulation.object_part)
-    maps: dict[str, Any] = {}
-    for of_effect in simulation.detector_maps.values():
-        maps |= of_effect
-    if maps:
-        np.savez_compressed(detector_path(session_dir), **maps)
+    each = simulation.detector_maps.values()
+    if maps := {name: values for of_effect in each for name, values in of_effect.items()}:
+        np.savez_compressed(folder / DETECTOR, **maps)
 
 
 def write_pixels(
@@ -200,11 +199,6 @@ def write_pixels(
         arrays["light_spectra"] = frame.light.spectra
     arrays |= {f"illumination_{i}": factor for i, factor in enumerate(frame.light.illumination)}
     np.savez_compressed(path, **arrays)
-
-
-def detector_path(session_dir: Path) -> Path:
-    """Path of the detector's maps."""
-    return session_dir / "truth" / "detector.npz"
 
 
 def pixels_path(session_dir: Path, capture: str) -> Path:

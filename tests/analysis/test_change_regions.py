@@ -91,7 +91,7 @@ def test_without_a_significant_patch_there_is_no_region(plane):
 def test_a_region_that_grew_one_that_is_new_and_one_that_is_gone(plane):
     before = (disc(plane, 0.02, 0.006) > 0.5) | (disc(plane, 0.05, 0.004) > 0.5)
     after = (disc(plane, 0.021, 0.008) > 0.5) | (disc(plane, 0.037, 0.003) > 0.5)
-    found = grown_regions(*plane, before, after, 1e-6)
+    found = grown_regions(*plane, before, after)
     expected = [(np.pi * 0.006**2, np.pi * 0.008**2), (np.pi * 0.004**2, 0.0), (0.0, np.pi * 0.003**2)]
     assert [one.before_m2 for one in found] == pytest.approx([a for a, _ in expected], rel=0.05)
     assert [one.after_m2 for one in found] == pytest.approx([b for _, b in expected], rel=0.05)

@@ -25,7 +25,7 @@ from hsi_sc_nerf.packed.dataset import open_packed
 CONFIG = MeshConfig(octree_depth=5, smoothing_radius_m=0.003, base_height_m=STAND_M)
 
 
-def uncertainty(cloud, splits=0, done=None):
+def uncertainty(cloud, splits=0, done=int):
     """Without errors that points share, for which alone the mesh is needed."""
     return size_uncertainty(*cloud, None, CONFIG, splits, None, done)
 

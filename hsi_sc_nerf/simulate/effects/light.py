@@ -37,8 +37,8 @@ class ChamberShading(SurfaceLightEffect):
 
     def on_surface(self, light: SurfaceLight) -> SurfaceLight:
         """Multiply the chamber's light by its visibility."""
-        visibility = light.surface.surroundings(self.directions).chamber_visibility.astype(np.float32)
-        return replace(light, chamber_lit=light.chamber_lit * visibility[:, None])
+        visibility, _ = light.surface.surroundings(self.directions)
+        return replace(light, chamber_lit=light.chamber_lit * visibility.astype(np.float32)[:, None])
 
 
 @dataclass(frozen=True)
@@ -58,9 +58,9 @@ class InterReflection(SurfaceLightEffect):
 
     def on_surface(self, light: SurfaceLight) -> SurfaceLight:
         """Add one colour for each set of materials that light meets on its way."""
-        around = light.surface.surroundings(self.directions)
-        plain = light.materials * around.chamber_visibility.astype(np.float32)[:, None]
-        reflect = Reflection(around.form_factors, self.bounces)
+        visibility, form_factors = light.surface.surroundings(self.directions)
+        plain = light.materials * visibility.astype(np.float32)[:, None]
+        reflect = Reflection(form_factors, self.bounces)
         bounced = reflect(light.colours, light.chamber_lit, light.materials)
         chamber_lit = np.column_stack([plain, *bounced.values()])
         lamp_lit = np.zeros_like(chamber_lit)

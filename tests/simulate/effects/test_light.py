@@ -82,9 +82,9 @@ def test_reflections_sum_the_series_of_form_factors(still_life, bounces):
     effects = ChamberShading(16), InterReflection(16, bounces), Lamp(0.5)
     lighting = Lighting(still_life, effects)
     surface, camera = lighting._light.surface, np.eye(4)
-    around = surface.surroundings(16)
-    factors = around.form_factors.toarray()
-    arriving, expected = 0.5 * around.chamber_visibility + Lamp(0.5).on_points(surface, camera), 0.0
+    visibility, form_factors = surface.surroundings(16)
+    factors = form_factors.toarray()
+    arriving, expected = 0.5 * visibility + Lamp(0.5).on_points(surface, camera), 0.0
     for _ in range(bounces):
         arriving = factors @ arriving
         expected = expected + arriving
