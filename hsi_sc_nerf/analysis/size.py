@@ -17,6 +17,7 @@ from scipy.spatial import ConvexHull
 
 from hsi_sc_nerf.analysis.closed_mesh import MeshConfig, closed, closed_mesh, surface_and_base
 from hsi_sc_nerf.analysis.surface_errors import hollow_std_m, most_frontal_cosine, surface_std_m
+from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import content_of, read_json
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.packed.dataset import PackedDataset
@@ -131,12 +132,20 @@ def size_uncertainty(
         systematic: what the points have in common, if it is known.
         done: called with the number of finished sizes, of `sizes_to_find`.
 
+    Raises:
+        InputError: the object is too small to be smoothed by twice the radius.
+
     Example:
         >>> parts = size_uncertainty(cloud.points, cloud.normals, mesh, MeshConfig(), splits=6)
         >>> combined(parts).volume_l
         0.0021
     """
     config = replace(config, octree_depth=min(config.octree_depth, VARIED_DEPTH))
+    coarser = replace(config, smoothing_radius_m=COARSER * config.smoothing_radius_m)
+    try:
+        coarse = surface_and_base(points_m, normals, coarser)
+    except InputError as error:
+        raise InputError(f"the uncertainty of sizes also needs twice the smoothing radius, and {error}") from error
     finished = itertools.count(1)
 
     def size(varied: Mesh) -> np.ndarray:
@@ -157,8 +166,7 @@ def size_uncertainty(
         others.append(replace(base, height_m=base.height_m - systematic.base_m))
     changes = [size(closed(seen, outward, other, config)) - usual for other in others]
     parts["base"] = np.sqrt(np.square(changes).sum(axis=0))
-    coarser = replace(config, smoothing_radius_m=COARSER * config.smoothing_radius_m)
-    parts["detail"] = np.abs(size(closed(*surface_and_base(points_m, normals, coarser), coarser)) - usual)
+    parts["detail"] = np.abs(size(closed(*coarse, coarser)) - usual)
     if systematic is not None:
         whole = np.array(astuple(size_of(mesh)))
         parts["scale"] = systematic.scale * whole * DIMENSIONS

@@ -84,6 +84,14 @@ def test_detail_that_smoothing_changes_is_uncertain(smooth_parts):
     assert uncertainty((rough, normals))["detail"].area_m2 > 3 * smooth_parts["detail"].area_m2
 
 
+def test_an_object_too_small_to_be_smoothed_twice_as_much_is_told_before_it_is_measured():
+    points, normals = sphere_points(6000, above=-0.93)
+    grain = 0.15 * (points - [0.0, 0.0, STAND_M]) + [0.0, 0.0, STAND_M], normals
+    closed_mesh(*grain, CONFIG)
+    with pytest.raises(InputError, match=r"also needs twice the smoothing radius, and .* of 0\.006 m.* lower the"):
+        uncertainty(grain, done=pytest.fail)
+
+
 def test_causes_add_up_in_squares():
     parts = {"points": Size(*[3.0] * 6), "scale": Size(*[4.0] * 6)}
     assert combined(parts) == Size(*[5.0] * 6)
