@@ -155,7 +155,9 @@ def changes(
     found: dict[str, Quantity] = {}
     if len(one.wavelengths_nm) > 1:
         units = [unit_vectors(day.surface.spectra) for day in days]
-        axes = _axes((units[1] - units[0])[seen])
+        # Principal components of the changes of spectra.
+        vectors = np.linalg.eigh(np.cov((units[1] - units[0])[seen], rowvar=False))[1]
+        axes = vectors[:, ::-1][:, : min(COMPONENTS, len(vectors) - 1)].T
         shared = unit_vectors(typical * (1.0 + modes)) - unit_vectors(typical)
         angle = 2.0 * np.arcsin(np.clip(np.linalg.norm(units[1] - units[0], axis=1) / 2.0, 0.0, 1.0))
         found[SPECTRUM] = tested(
@@ -212,12 +214,6 @@ def _scalars(
         (band,) = require_bands(nm, [wavelength], "--band-nm")
         values[_band_name(wavelength)] = spectra[:, band]
     return values | {index.name: index_values(index, spectra, nm) for index in indices}
-
-
-def _axes(change: Float[np.ndarray, "n bands"]) -> Float[np.ndarray, "k bands"]:
-    """Principal components of the changes of spectra."""
-    vectors = np.linalg.eigh(np.cov(change, rowvar=False))[1]
-    return vectors[:, ::-1][:, : min(COMPONENTS, change.shape[1] - 1)].T
 
 
 def _misplaced_m(before: Day, after: Day, vertices_m: Float[np.ndarray, "v 3"]) -> float:
