@@ -277,8 +277,10 @@ def _domain(head: dict[str, str], columns: dict[str, np.ndarray]) -> Domain | No
         raise ValueError("t2_limit and q_limit must be numbers")
     if not (limits[0] < math.inf or limits[1] < math.inf):
         return None
+    # By their numbers, as the variances are: programs also order columns by the alphabet.
+    ordered = sorted(columns, key=lambda name: (len(name), name))
     weights, loadings = (
-        np.stack(found, axis=1) if (found := [c for name, c in columns.items() if name.startswith(kind)]) else None
+        np.stack(found, axis=1) if (found := [columns[name] for name in ordered if name.startswith(kind)]) else None
         for kind in ("weight", "loading")
     )
     if "mean" not in columns or weights is None or loadings is None or weights.shape != loadings.shape:

@@ -114,6 +114,17 @@ def test_the_code_of_the_page_writes_limits_that_hold_its_own_spectra(tmp_path, 
     assert np.isnan(calibration.of(strange[None], nm, only_inside=True)).all()
 
 
+def test_the_components_of_the_limits_go_by_their_numbers_in_whatever_order_their_columns_stand(fitted):
+    domain, (*head, titles) = read_calibration(fitted).domain, fitted.read_text().split("\nwavelength_nm,", 1)
+    titles, *rows = f"wavelength_nm,{titles}".splitlines()
+    order = np.argsort(titles.split(","))[::-1]
+    lines = [",".join(np.array(row.split(","))[order]) for row in (titles, *rows)]
+    fitted.write_text("\n".join([*head, *lines]))
+    again = read_calibration(fitted).domain
+    np.testing.assert_array_equal(again.weights, domain.weights)
+    np.testing.assert_array_equal(again.loadings, domain.loadings)
+
+
 def test_each_limit_counts_alone(fitted):
     text = fitted.read_text()
     extreme = simulated(200)[0]
