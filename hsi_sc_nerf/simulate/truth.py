@@ -175,7 +175,8 @@ def write_truth(session_dir: Path, simulation: Simulation) -> None:
         table.writerows(np.column_stack([wavelengths_nm, simulation.endmembers.T]).tolist())
     write_true_mesh(folder / "mesh.ply", simulation.object_part)
     each = simulation.detector_maps.values()
-    if maps := {name: values for of_effect in each for name, values in of_effect.items()}:
+    maps: dict[str, Any] = {name: values for of_effect in each for name, values in of_effect.items()}
+    if maps:
         np.savez_compressed(folder / DETECTOR, **maps)
 
 
