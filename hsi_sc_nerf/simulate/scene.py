@@ -301,6 +301,7 @@ def read_effects(values: Sequence[Any], source: str) -> tuple[Effect, ...]:
             raise InputError(f"{source}: effect {name!r} is unknown; known are {', '.join(EFFECTS)}.")
         if name in found:
             raise InputError(f"{source}: effect {name} is named twice; name it once.")
-        found[name] = read_dataclass(EFFECTS[name], settings or {}, source, f"effects.{name}.")
+        settings = {} if settings is None else settings
+        found[name] = read_dataclass(EFFECTS[name], settings, source, f"effects.{name}.")
         check_ranges(found[name], source, f"effects.{name}.")
     return tuple(found[name] for name in EFFECTS if name in found)

@@ -93,6 +93,7 @@ def test_paths_are_relative_to_the_scene_file(tmp_path):
         (GOOD.replace("markers: {side_m: 0.036}", "markers: 3"), "markers must hold"),
         (GOOD + "effects: [noise]\n", "effect 'noise' is unknown"),
         (GOOD + "effects: noise\n", "effects is 'noise', but must be a list"),
+        (GOOD + "effects: [{read_noise: 0}]\n", "effects.read_noise must hold `key: value` lines"),
         (GOOD + "name: ../elsewhere\n", "name is '../elsewhere', but"),
         ("object: [", "not valid YAML"),
         ("object: " + "[" * 5000, "nested too deeply"),
