@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.analysis.change_features import surface_samples
@@ -101,7 +101,10 @@ def days_on_one_mesh(
         distance_m, near = cKDTree(moved.points).query(mesh.vertices, k=min(NEIGHBOURS, len(moved.points)))
         offset = moved.points[near].mean(axis=1) - mesh.vertices
         raised_m = np.einsum("vj,vj->v", offset, normals)
-        seen = surface.seen & ~_beyond_edge(offset, raised_m, normals, distance_m[:, -1], config.smoothing_radius_m)
+        # Beyond the edge of a cloud, the nearest points all lie on one side and say nothing of the vertex.
+        aside_m = np.linalg.norm(offset - raised_m[:, None] * normals, axis=1)
+        beyond_edge = (aside_m > _ONE_SIDED * distance_m[:, -1]) & (aside_m > config.smoothing_radius_m / 2.0)
+        seen = surface.seen & ~beyond_edge
         seen_raised_m = np.where(seen, raised_m, np.nan)
         days.append(Day(name, replace(surface, seen=seen), seen_raised_m, _conditions(moved, near), attitude))
     return days
@@ -111,21 +114,6 @@ def _with_ascending_bands(cloud: SpectralCloud) -> SpectralCloud:
     """The same cloud; other programs write bands in any order."""
     order = np.argsort(cloud.wavelengths_nm)
     return replace(cloud, spectra=cloud.spectra[:, order], wavelengths_nm=cloud.wavelengths_nm[order])
-
-
-def _beyond_edge(
-    offset: Float[np.ndarray, "v 3"],
-    raised_m: Float[np.ndarray, "v"],
-    normals: Float[np.ndarray, "v 3"],
-    furthest_m: Float[np.ndarray, "v"],
-    detail_m: float,
-) -> Bool[np.ndarray, "v"]:
-    """Whether a vertex lies beyond the edge of a cloud, whose points near it have their mean at ``offset``.
-
-    There, the nearest points all lie on one side, and their spectra say nothing of the vertex.
-    """
-    aside_m = np.linalg.norm(offset - raised_m[:, None] * normals, axis=1)
-    return (aside_m > _ONE_SIDED * furthest_m) & (aside_m > detail_m / 2.0)
 
 
 def _conditions(cloud: SpectralCloud, near: Int[np.ndarray, "v k"]) -> Float[np.ndarray, "v 3"]:

@@ -44,7 +44,8 @@ _STRIP = 0.06
 """A part there of which no point is further from the rest than this fraction of the object's height is a strip of
 such pixels."""
 _STANDS_OFF = 0.7
-"""Distance of a part's farthest point from the rest, over its length: 1 for a leaf, 0.5 for a spot."""
+"""Distance of a part's farthest point from the rest, over its length: 1 for a leaf, which is fixed at one end, 0.5
+for a spot."""
 
 
 def propose_organs(
@@ -165,7 +166,9 @@ def _part_at_side(surface: _Surface, rest: Bool[np.ndarray, "n"]) -> _Part | Non
     part = _largest_piece(beside(edge, features, rest), near)
     if edge.separation < _LEAST_SEPARATION or not LEAST_POINTS <= part.sum() <= _SMALL * len(part):
         return None
-    if not _stands_off(points_m, part):
+    own = points_m[part]
+    length_m = 2.0 * np.linalg.norm(own - own.mean(axis=0), axis=1).max()
+    if _depth_m(points_m, part) <= _STANDS_OFF * length_m:
         return None, part, edge
     return STEM if _is_slender(points_m[part]) else LEAF, part, edge
 
@@ -197,16 +200,6 @@ def _is_mixed_with_support(
     low, high = np.quantile(height[part], (1.0 / 3.0, 2.0 / 3.0))
     middle = (low < height[part]) & (height[part] < high)
     return bool(np.median(contrast[middle]) < _LEAST_EVENNESS * np.median(contrast[height[part] <= low]))
-
-
-def _stands_off(points_m: Float[np.ndarray, "n 3"], part: Bool[np.ndarray, "n"]) -> bool:
-    """Whether a part is fixed at one of its ends: its farthest point is as far from the rest as it is long.
-
-    The middle of a spot is half as far from the rest.
-    """
-    own = points_m[part]
-    length_m = 2.0 * np.linalg.norm(own - own.mean(axis=0), axis=1).max()
-    return bool(_depth_m(points_m, part) > _STANDS_OFF * length_m)
 
 
 def _depth_m(points_m: Float[np.ndarray, "n 3"], part: Bool[np.ndarray, "n"]) -> float:

@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf import paper
@@ -104,7 +104,10 @@ def with_spectra(
             f"no point of the cloud is seen at {max_incidence_deg:g} degrees or less from the front; raise "
             "--max-incidence-deg."
         )
-    neighbours, weights, seen = _neighbours(mesh.vertices, cloud.points[used], seen_within_m)
+    count = np.arange(1, min(NEIGHBOURS, len(used)) + 1)
+    distance_m, neighbours = cKDTree(cloud.points[used]).query(mesh.vertices, count, workers=-1)
+    weights = np.exp(-2.0 * (distance_m / np.maximum(distance_m[:, -1:], 1e-12)) ** 2).astype(np.float32)
+    weights, seen = weights / weights.sum(axis=1, keepdims=True), distance_m[:, 0] <= seen_within_m
 
     def mean(values: Float[np.ndarray, "n columns"]) -> Float[np.ndarray, "v columns"]:
         found = np.empty((len(neighbours), values.shape[1]), np.float32)
@@ -123,16 +126,6 @@ def with_spectra(
             of_points = cloud.extra["spectral_std"] / np.sqrt(cloud.extra["views"])
         scatter = mean(of_points[:, None])[:, 0]
     return SpectralMesh(mesh, spectra, cloud.wavelengths_nm, seen, lit, scatter)
-
-
-def _neighbours(
-    vertices: Float[np.ndarray, "v 3"], points: Float[np.ndarray, "n 3"], seen_within_m: float
-) -> tuple[Int[np.ndarray, "v k"], Float[np.ndarray, "v k"], Bool[np.ndarray, "v"]]:
-    """The nearest points of each vertex, their weights, and whether the first is within ``seen_within_m``."""
-    count = min(NEIGHBOURS, len(points))
-    distance_m, neighbours = cKDTree(points).query(vertices, np.arange(1, count + 1), workers=-1)
-    weights = np.exp(-2.0 * (distance_m / np.maximum(distance_m[:, -1:], 1e-12)) ** 2).astype(np.float32)
-    return neighbours, weights / weights.sum(axis=1, keepdims=True), distance_m[:, 0] <= seen_within_m
 
 
 def write_spectral_mesh(path: Path, surface: SpectralMesh, extra: dict[str, Float[np.ndarray, "v"]]) -> None:
