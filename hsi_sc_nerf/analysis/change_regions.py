@@ -178,10 +178,7 @@ def _contrast(values: Float[np.ndarray, "n"], low: float, height: float) -> floa
 
 
 def grown_regions(
-    mesh: Mesh,
-    areas_m2: Float[np.ndarray, "v"],
-    before: Bool[np.ndarray, "v"],
-    after: Bool[np.ndarray, "v"],
+    mesh: Mesh, areas_m2: Float[np.ndarray, "v"], before: Bool[np.ndarray, "v"], after: Bool[np.ndarray, "v"]
 ) -> list[GrownRegion]:
     """Areas of the regions that have a property before or after; what overlaps is one region. The largest first.
 

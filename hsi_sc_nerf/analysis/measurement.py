@@ -135,11 +135,9 @@ def measure_traits(
         closed = closed_mesh(cloud.points, cloud.normals, config)
     uncertainty: dict[str, Size] = {}
     if splits:
-        systematic = (
-            None
-            if dataset is None
-            else systematic_errors(closed, dataset, base_known=config.base_height_m is not None)
-        )
+        systematic = None
+        if dataset is not None:
+            systematic = systematic_errors(closed, dataset, base_known=config.base_height_m is not None)
         with progress_bar("uncertainty", "meshes", sizes_to_find(splits, systematic)) as done:
             uncertainty = size_uncertainty(cloud.points, cloud.normals, closed, config, splits, systematic, done=done)
     with console.status("spectra on the surface"):

@@ -210,9 +210,8 @@ def systematic_errors(mesh: Mesh, dataset: PackedDataset, *, base_known: bool) -
 def pixel_on_object_m(dataset: PackedDataset) -> float:
     """Side of a pixel in the middle of the object, as the mean of all frames."""
     centre_m = dataset.object_box_m.mean(axis=0)
-    return (
-        float(np.linalg.norm(dataset.camera_to_worlds[:, :3, 3] - centre_m, axis=1).mean()) / dataset.intrinsics.fl_x
-    )
+    distances_m = np.linalg.norm(dataset.camera_to_worlds[:, :3, 3] - centre_m, axis=1)
+    return float(distances_m.mean()) / dataset.intrinsics.fl_x
 
 
 def offset(mesh: Mesh, distance_m: Float[np.ndarray, "v"]) -> Mesh:

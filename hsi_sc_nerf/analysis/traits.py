@@ -206,12 +206,17 @@ def analyse(
         areas_m2 = surface.areas_m2[where]
         spectrum, light = region_spectrum(surface, where), _light(surface, where)
         noise = _noise_std(surface, where, pixel_m, light)
+        std = math.nan
+        if pixel_m is not None and not math.isnan(noise):
+            # By how much frames disagree over the region's pixels, what they mix, and what is known of its light.
+            shared = 0.0 if light is None else spectrum.mean.mean() * light.irradiance_std / light.irradiance.mean
+            std = math.hypot(noise, _mixed(surface, where, pixel_m), shared)
         return RegionTraits(
             name,
             float(areas_m2.sum()),
             spectrum,
             {one.name: _map_mean(one, where, surface, spectrum, noise) for one in maps},
-            _reflectance_std(surface, where, pixel_m, noise, spectrum, light),
+            std,
             light,
             {one.name: class_areas(one, where, surface, pixel_m) for one in class_maps},
         )
@@ -222,21 +227,6 @@ def analyse(
 def region_spectrum(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"]) -> MeanAndSd:
     """Mean and standard deviation of the chosen vertices' spectra, weighted by their area."""
     return weighted_mean_and_sd(surface.spectra[chosen], surface.areas_m2[chosen])
-
-
-def _reflectance_std(
-    surface: SpectralMesh,
-    chosen: Bool[np.ndarray, "v"],
-    pixel_m: float | None,
-    noise: float,
-    spectrum: MeanAndSd,
-    light: RegionLight | None,
-) -> float:
-    """By how much frames disagree over the region's pixels, by what they mix, and by what is known of its light."""
-    if pixel_m is None or math.isnan(noise):
-        return math.nan
-    shared = 0.0 if light is None else spectrum.mean.mean() * light.irradiance_std / light.irradiance.mean
-    return math.hypot(noise, _mixed(surface, chosen, pixel_m), shared)
 
 
 def _noise_std(

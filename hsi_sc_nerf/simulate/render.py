@@ -99,13 +99,6 @@ class Hits:
         normals = self.renderer.facet_normals[self.triangle]
         return np.where(self.is_back_face[:, None], -normals, normals)
 
-    def is_unoccluded(
-        self, directions: Float[np.ndarray, "*n 3"], some: Int[np.ndarray, "n"]
-    ) -> Bool[np.ndarray, "n"]:
-        """Whether rays from some of the hits, one direction each or the same for all, hit nothing."""
-        starts = self.positions()[some] + RAY_START_M * self.facing_normals[some]
-        return unoccluded(self.renderer.scene, starts, np.broadcast_to(directions, starts.shape))
-
     def onwards(self, directions: Float[np.ndarray, "n 3"], some: Int[np.ndarray, "n"]) -> Hits:
         """First hits of rays that start at some of the hits, in the same pixels."""
         starts = self.positions()[some] + RAY_START_M * self.facing_normals[some]
@@ -145,7 +138,6 @@ class Renderer:
         materials: material of each column of the weights; extra materials and then the chamber come last.
         vertices, triangles, weights: of all parts, concatenated.
         is_object: which triangles belong to the scanned object.
-        scene: Open3D's, of all parts.
     """
 
     def __init__(self, parts: Sequence[Part], extra_materials: Sequence[str] = ()) -> None:
@@ -164,7 +156,7 @@ class Renderer:
         self.triangles = np.concatenate(triangles)
         self.weights = np.concatenate(weights)
         self.is_object = np.concatenate(is_object)
-        self.scene = ray_scene(self.vertices, self.triangles)
+        self._scene = ray_scene(self.vertices, self.triangles)
 
     @cached_property
     def facet_normals(self) -> Float[np.ndarray, "t 3"]:
@@ -192,7 +184,7 @@ class Renderer:
         self, origins: Float[np.ndarray, "rays 3"], directions: Float[np.ndarray, "rays 3"], rays_per_pixel: int
     ) -> Hits:
         """First hits of rays with unit directions."""
-        hits = self.scene.cast_rays(rays_for_scene(origins, directions))
+        hits = self._scene.cast_rays(rays_for_scene(origins, directions))
         distance_m = hits["t_hit"].numpy()
         ray = np.flatnonzero(np.isfinite(distance_m))
         u, v = hits["primitive_uvs"].numpy()[ray].T
@@ -206,6 +198,13 @@ class Renderer:
             barycentric=np.stack([1.0 - u - v, u, v]),
             distance_m=distance_m[ray],
         )
+
+    def is_free(
+        self, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "3"]
+    ) -> Bool[np.ndarray, "n"]:
+        """Whether rays in one direction from points of a surface, metres, hit nothing."""
+        starts = points + RAY_START_M * normals
+        return unoccluded(self._scene, starts, np.broadcast_to(direction, starts.shape))
 
     def material_weights(self, hits: Hits) -> Float[np.ndarray, "pixels materials"]:
         """Fraction of each material in each pixel, summing to exactly 1."""

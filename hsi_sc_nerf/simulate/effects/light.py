@@ -12,11 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from hsi_sc_nerf.geometry.camera import unit_vectors
-from hsi_sc_nerf.geometry.mesh import unoccluded
 from hsi_sc_nerf.settings_file import between
 from hsi_sc_nerf.simulate.effect import Effect
 from hsi_sc_nerf.simulate.light import HitLight, Reflection, SurfaceLight, SurfaceLightEffect, ViewLightEffect
-from hsi_sc_nerf.simulate.render import RAY_START_M, Hits
+from hsi_sc_nerf.simulate.render import Hits
 from hsi_sc_nerf.simulate.surface import SceneSurface
 
 DIRECTIONS = 96
@@ -93,16 +92,15 @@ class Lamp(ViewLightEffect):
         cosine = hits.facing_normals @ to_lamp
         lit = np.flatnonzero(cosine > 0.0)
         lamp = np.zeros_like(light.lamp)
-        lamp[lit] = self.fraction * cosine[lit] * hits.is_unoccluded(to_lamp, lit)
+        is_free = hits.renderer.is_free(hits.positions()[lit], hits.facing_normals[lit], to_lamp)
+        lamp[lit] = self.fraction * cosine[lit] * is_free
         return replace(light, chamber=light.chamber * np.float32(1.0 - self.fraction), lamp=lamp, to_lamp=to_lamp)
 
     def on_points(self, surface: SceneSurface, camera_to_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "p"]:
         """Irradiance of the lamp at the points of a surface."""
         to_lamp, normals = self.direction(camera_to_world), surface.mesh.vertex_normals()
-        cosine = np.maximum(normals @ to_lamp, 0.0)
-        starts = surface.mesh.vertices + RAY_START_M * normals
-        is_lit = unoccluded(surface.renderer.scene, starts, np.broadcast_to(to_lamp, starts.shape))
-        return self.fraction * cosine * is_lit
+        is_free = surface.renderer.is_free(surface.mesh.vertices, normals, to_lamp)
+        return self.fraction * np.maximum(normals @ to_lamp, 0.0) * is_free
 
     def direction(self, camera_to_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "3"]:
         """Unit vector from the object to the lamp, object frame."""
