@@ -62,7 +62,7 @@ def resume_effects(config: TrainerConfig) -> Path | None:
 def _trained_effects(setting: str, checkpoint: Path) -> str:
     with content_of(checkpoint, "state of a training", "take an earlier one"):
         trained = read_checkpoint(checkpoint)["training"].get("effects")
-    if trained is None or setting in ("auto", trained):
+    if trained is None or setting == "auto" or set(_named(setting)) == set(_named(trained)):
         return trained or setting
     raise InputError(
         f"{checkpoint}: was trained with --pipeline.model.effects {trained}; leave the option out to go on with it."

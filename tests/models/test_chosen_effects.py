@@ -100,6 +100,9 @@ def test_a_run_keeps_its_effects_when_the_dataset_changes(tiny_dataset, tmp_path
     resumed, model = made(data, tmp_path / "resumed", load_dir=first.checkpoint_dir)
     assert model.effects == ("view_dependence",)
     assert resumed._start_step == 1
+    both = made(data, tmp_path / "both", "pose_refinement,view_dependence")[0]
+    both.save_checkpoint(0)
+    made(data, tmp_path / "again", "pose_refinement,view_dependence", load_dir=both.checkpoint_dir)
     _, anew = made(data, tmp_path / "anew")
     assert anew.effects == ("still_chamber",)
     with pytest.raises(SystemExit, match="view_dependence"):
