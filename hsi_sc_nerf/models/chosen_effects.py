@@ -46,27 +46,28 @@ def chosen_effects(setting: str, dataset: PackedDataset) -> tuple[str, ...]:
     return tuple(name for name in MODEL_EFFECTS if name in present)
 
 
-def resume_effects(config: TrainerConfig) -> Path | None:
-    """Take the effects of the checkpoint that a run goes on from into its settings; gives it, None for a new run.
+def resume_effects(config: TrainerConfig) -> tuple[Path, dict[str, Any]] | None:
+    """Take the effects of the checkpoint that a run goes on from into its settings.
+
+    Returns:
+        Its path, and what it holds (`read_checkpoint`); None for a new run.
 
     Raises:
         InputError: the settings ask for others, or there is no such checkpoint, or it cannot be read.
     """
     path = config.load_checkpoint if config.load_dir is None else find_checkpoint(config.load_dir, config.load_step)
-    if path is not None:
-        model = cast(Any, config.pipeline.model)
-        model.effects = _trained_effects(model.effects, path)
-    return path
-
-
-def _trained_effects(setting: str, checkpoint: Path) -> str:
-    with content_of(checkpoint, "state of a training", "take an earlier one"):
-        trained = read_checkpoint(checkpoint)["training"].get("effects")
-    if trained is None or setting == "auto" or set(_named(setting)) == set(_named(trained)):
-        return trained or setting
-    raise InputError(
-        f"{checkpoint}: was trained with --pipeline.model.effects {trained}; leave the option out to go on with it."
-    )
+    if path is None:
+        return None
+    state, model = read_checkpoint(path), cast(Any, config.pipeline.model)
+    with content_of(path, "state of a training", "take an earlier one"):
+        trained = state["training"].get("effects") or model.effects
+        same = model.effects == "auto" or set(_named(model.effects)) == set(_named(trained))
+    if not same:
+        raise InputError(
+            f"{path}: was trained with --pipeline.model.effects {trained}; leave the option out to go on with it."
+        )
+    model.effects = trained
+    return path, state
 
 
 def effects_setting(effects: tuple[str, ...]) -> str:

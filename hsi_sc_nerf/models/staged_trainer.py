@@ -24,7 +24,7 @@ from hsi_sc_nerf.data.dataparser import require_data
 from hsi_sc_nerf.errors import InputError, one_sentence
 from hsi_sc_nerf.files import atomic_write, content_of, make_folder, write_json
 from hsi_sc_nerf.models.captured_step import CapturedSteps
-from hsi_sc_nerf.models.checkpoints import checkpoint_path, link_checkpoint, read_checkpoint, write_checkpoint
+from hsi_sc_nerf.models.checkpoints import checkpoint_path, link_checkpoint, write_checkpoint
 from hsi_sc_nerf.models.chosen_effects import effects_setting, resume_effects
 from hsi_sc_nerf.models.occupancy_sampler import OccupancySampler
 from hsi_sc_nerf.models.optimizers import GuardedOptimizers
@@ -32,7 +32,7 @@ from hsi_sc_nerf.models.pipeline import SpectralPipeline
 from hsi_sc_nerf.models.presets import Preset, apply_preset
 from hsi_sc_nerf.models.run_settings import discard_unbegun, read_config
 from hsi_sc_nerf.models.schedule import Clock, Schedule
-from hsi_sc_nerf.models.spectral_model import SpectralModel, SpectralModelConfig
+from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.models.stages import (
     StageConfig,
     StagePlan,
@@ -109,14 +109,15 @@ class StagedTrainerConfig(TrainerConfig):
                 return plan_seconds(stages, self.max_train_seconds)
             return plan_stages(stages, self.max_num_iterations)
 
-    def save_config(self) -> None:
-        """Check the settings, then write ``config.yml``, the first file of a run, whole or not at all."""
+    def save_config(self, checked: bool = False) -> None:
+        """Check the settings unless that is done, and write ``config.yml``, the first file of a run, whole or not."""
         self.plan()
         path = self.get_base_dir() / "config.yml"
         CONSOLE.log(f"Saving config to: {path}")
         with one_sentence(), interruption.one_line():
-            require_data(self.pipeline.datamanager)
-            resume_effects(self)
+            if not checked:
+                require_data(self.pipeline.datamanager)
+                resume_effects(self)
             make_folder(path.parent)
             (saved := copy.copy(self)).load_step = None  # nerfstudio's evaluation takes it for the step to evaluate
             with atomic_write(path) as (temporary,):
@@ -131,6 +132,16 @@ class StagedTrainer(Trainer):
     """
 
     config: StagedTrainerConfig
+    _loaded: Path | None
+
+    @property
+    def training_state(self) -> Literal["training", "paused", "completed"]:
+        """nerfstudio's, which the viewer's button changes at any time; a pause does not count for the clock."""
+        return self._training_state
+
+    @training_state.setter
+    def training_state(self, state: Literal["training", "paused", "completed"]) -> None:
+        self._training_state, self._state_was_set = state, True
     optimizers: GuardedOptimizers
     pipeline: SpectralPipeline
 
@@ -147,16 +158,14 @@ class StagedTrainer(Trainer):
         self.stop_training = False  # nerfstudio sets it when the training begins; single steps read it too
         try:
             with one_sentence(), interruption.one_line(self._stopped), files_of_run(self.base_dir):
-                self._loaded = resume_effects(self.config)
+                self._loaded, self._state = resume_effects(self.config) or (None, {})
                 super().setup(test_mode)
         except SystemExit:
             discard_unbegun(self.base_dir)
             raise
         # Evaluation and export build what was trained, whatever becomes of the dataset.
-        cast(SpectralModelConfig, (config := self.config).pipeline.model).effects = effects_setting(
-            self._model.effects
-        )
-        config.save_config()
+        self._model.config.effects = effects_setting(self._model.effects)
+        (config := self.config).save_config(checked=True)
         plain = not (config.mixed_precision or config.use_grad_scaler or config.log_gradients)
         plain = plain and config.capture_steps and not config.gradient_accumulation_steps
         if self.pipeline.device.type == "cuda" and plain:
@@ -337,7 +346,7 @@ class StagedTrainer(Trainer):
         """Load a checkpoint of `save_checkpoint`, with the contents of ``training``."""
         if (path := self._loaded) is None:
             return
-        state = read_checkpoint(path)
+        state, self._state = self._state, {}  # which is as large as the model
         with content_of(path, "state of a training", "take an earlier one"):
             self._start_step = state["step"] + 1
             self._trained_step = state["step"]

@@ -3,12 +3,14 @@
 import copy
 import json
 import shutil
+from unittest.mock import Mock
 
 import pytest
 import torch
 from nerfstudio.configs.base_config import MachineConfig
 from small_trainer import trainer
 
+from hsi_sc_nerf.models import checkpoints
 from hsi_sc_nerf.models.pipeline import SpectralPipeline
 from hsi_sc_nerf.models.run_settings import read_config
 from hsi_sc_nerf.models.stages import full_frame_stage
@@ -221,13 +223,16 @@ def test_unusable_checkpoints_are_refused_in_a_sentence_and_leave_no_run(tiny_da
 
 
 @pytest.mark.slow
-def test_a_run_that_went_on_from_a_step_is_evaluated_at_its_last(tiny_dataset, tmp_path, whole):
-    """nerfstudio's evaluation takes ``load_step`` of config.yml for the step to evaluate."""
+def test_a_run_that_went_on_from_a_step_is_evaluated_at_its_last(tiny_dataset, tmp_path, whole, monkeypatch):
+    """nerfstudio's evaluation takes ``load_step`` of config.yml for the step to evaluate. It is read once."""
+    read = Mock(side_effect=checkpoints.require_whole)
+    monkeypatch.setattr(checkpoints, "require_whole", read)
     step = checkpoint(whole.checkpoint_dir)["step"]
     earlier = tmp_path / "earlier"
     shutil.copytree(whole.checkpoint_dir, earlier)
     (earlier / "step-000000099.ckpt").write_bytes(b"damaged")
     made = longer(tiny_dataset, tmp_path, load_dir=earlier, load_step=step)
     assert made._start_step == step + 1
+    assert read.call_count == 1
     saved = read_config(made.base_dir / "config.yml")
     assert (saved.load_dir, saved.load_step) == (earlier, None)
