@@ -79,12 +79,16 @@ class Schedule:
             )
         return _NO_LIMIT if self._unit else int(self.plan.length) - steps_done
 
-    def begin_step(self, step: int) -> None:
+    def begin_step(self, step: int, after_pause: bool = False) -> None:
         """Take up the next stage if the last one is complete, and read the position before the step.
 
         The first step starts the clock; that of a resumed run goes on from where it was.
+
+        Args:
+            step: its number.
+            after_pause: leave out the time since the last step.
         """
-        if not self._begun:
+        if not self._begun or after_pause:
             self.clock, self._begun = TrainingClock(self.clock.wait, self.position if self._unit else 0.0), True
         if self.stage_complete and not self.complete:
             # A step longer than a whole stage does not skip that stage.

@@ -73,7 +73,7 @@ class StagedTrainerConfig(TrainerConfig):
     """fast, balanced or best: iterations and rays a step. Your own go before it."""
     max_train_seconds: float | None = between(0.001, math.inf, default=None)
     """End the run after so many seconds of training instead of --max-num-iterations; stages and learning rates follow
-    the clock. Evaluations and saving do not count. Two such runs do not have the same weights bit by bit."""
+    the clock. Evaluations, saving and pauses do not count. Two such runs do not have the same weights bit by bit."""
     train_clock: Clock = "wall"
     """Clock of --max-train-seconds: wall time, or processor time over all threads (cpu)."""
     evaluate_stages: bool = True
@@ -212,7 +212,8 @@ class StagedTrainer(Trainer):
 
     def train_iteration(self, step: int) -> TRAIN_INTERATION_OUTPUT:
         """One step of its stage."""
-        self.schedule.begin_step(step)
+        self.schedule.begin_step(step, after_pause=self._state_was_set)
+        self._state_was_set = self.training_state == "paused"
         stage, position = self.schedule.stage, self.schedule.position
         manager, of_stage = self.pipeline.datamanager, stage.config
         manager.foreground_ray_fraction = of_stage.foreground_ray_fraction

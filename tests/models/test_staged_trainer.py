@@ -8,6 +8,7 @@ import pytest
 import torch
 from clock_by_hand import time_by_hand
 from nerfstudio.configs.base_config import MachineConfig
+from nerfstudio.engine import trainer as nerfstudio_trainer
 from nerfstudio.utils import profiler, writer
 from scipy.ndimage import distance_transform_edt
 from small_trainer import trainer
@@ -280,6 +281,28 @@ def test_a_timed_run_ends_by_the_clock_and_goes_on_from_its_checkpoint(tiny_data
     assert later["step"] == 27
     with pytest.raises(SystemExit, match=r"hsi-sc-nerf: [^\n]*--max-num-iterations"):
         trainer(tiny_dataset, tmp_path / "other", load_dir=made.checkpoint_dir)
+
+
+@pytest.mark.slow
+def test_a_pause_in_the_viewer_does_not_shorten_a_timed_run(tiny_dataset, tmp_path, monkeypatch):
+    time, made = time_by_hand(monkeypatch), trainer(tiny_dataset, tmp_path, max_train_seconds=1.0)
+    original = made.pipeline.datamanager.next_train
+
+    def next_train(step):
+        time.now += 0.125
+        if step in (2, 3):
+            made.training_state = "paused"
+        return original(step)
+
+    def resumed(_):
+        time.now += 1000.0
+        made.training_state = "training"
+
+    made.pipeline.datamanager.next_train = next_train
+    monkeypatch.setattr(nerfstudio_trainer, "time", Mock(sleep=resumed))
+    made.train()
+    assert time.now > 2000.0
+    assert (made._trained_step, made.schedule.position) == (7, 1.0)
 
 
 @pytest.mark.slow
