@@ -38,7 +38,6 @@ from hsi_sc_nerf.models.stages import (
     StagePlan,
     full_frame_stage,
     masked_stage,
-    plan_seconds,
     plan_stages,
     step_seed,
 )
@@ -105,9 +104,8 @@ class StagedTrainerConfig(TrainerConfig):
                 )
             for stage in stages:
                 stage.require_groups(self.optimizers)
-            if self.max_train_seconds is not None:
-                return plan_seconds(stages, self.max_train_seconds)
-            return plan_stages(stages, self.max_num_iterations)
+            timed = self.max_train_seconds is not None
+            return plan_stages(stages, self.max_train_seconds or self.max_num_iterations, timed)
 
     def save_config(self, checked: bool = False) -> None:
         """Check the settings unless that is done, and write ``config.yml``, the first file of a run, whole or not."""

@@ -8,7 +8,7 @@ learning rates and its random numbers follow from the step alone, so that a resu
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -190,70 +190,55 @@ def resumed_plan(plan: StagePlan, name: str, start: float, completed_at: float |
     return StagePlan((*before, *later))
 
 
-def plan_stages(configs: Sequence[StageConfig], max_num_iterations: int) -> StagePlan:
-    """Divide a run of ``max_num_iterations`` steps into stages.
+def plan_stages(configs: Sequence[StageConfig], length: float, timed: bool = False) -> StagePlan:
+    """Divide a run into stages.
 
     A stage with ``num_iterations`` has that length; the others divide the remaining steps by their fractions. If all
     stages have a length, the run is as long as their sum. Stages of no steps are left out.
 
+    Args:
+        configs: the stages.
+        length: of the run, iterations or seconds.
+        timed: whether it is seconds.
+
     Raises:
-        InputError: there are no steps to train, or the stages' lengths leave none for the other stages.
+        InputError: there is nothing to train, the stages' lengths leave nothing for the other stages, or a stage of a
+            timed run has a number of iterations.
 
     Example:
-        >>> plan = plan_stages((full_frame_stage(), masked_stage()), max_num_iterations=500)
+        >>> plan = plan_stages((full_frame_stage(), masked_stage()), 500)
         >>> plan.at(300).config.name
         'masked'
     """
-    fixed = sum(config.num_iterations or 0 for config in configs)
     divided = [config for config in configs if config.num_iterations is None]
-    left = max_num_iterations - fixed
+    if timed and len(divided) < len(configs):
+        name = next(config.name for config in configs if config.num_iterations is not None)
+        raise InputError(
+            f"the {name} stage has num-iterations, and --max-train-seconds ends the run by the clock; "
+            "give the stage a fraction, or leave --max-train-seconds out."
+        )
+    fixed = sum(config.num_iterations or 0 for config in configs)
+    left = length - fixed
     if divided and left < 0:
         raise InputError(
-            f"the stages' num-iterations ({fixed}) exceed --max-num-iterations ({max_num_iterations}); raise the "
-            "latter, or give every stage its own."
+            f"the stages' num-iterations ({fixed}) exceed --max-num-iterations ({length}); raise the latter, or give "
+            "every stage its own."
         )
     weight = sum(config.fraction for config in divided)
     if divided and left > 0 and not weight > 0.0:
         raise InputError("the stages' fractions add up to 0; give one of them a fraction above 0.")
+    whole: Callable[[float], float] = float if timed else round
     stages: list[Stage] = []
-    start, cumulated = 0, 0.0
+    start, cumulated = 0.0, 0.0
     for config in configs:
-        if config.num_iterations is not None:
-            length = config.num_iterations
-        else:
+        own: float | None = config.num_iterations
+        if own is None:
             # Rounding the cumulated fractions, not each one, keeps the total exact.
-            before = round(left * cumulated / weight)
-            cumulated += config.fraction
-            length = round(left * cumulated / weight) - before
-        if length > 0:
-            stages.append(Stage(config, start, start + length))
-            start += length
+            before, cumulated = cumulated, cumulated + config.fraction
+            own = whole(left * cumulated / (weight or 1.0)) - whole(left * before / (weight or 1.0))
+        if own > 0:
+            stages.append(Stage(config, start, start + own, timed))
+            start += own
     if not stages:
-        raise InputError(
-            f"--max-num-iterations is {max_num_iterations}, which leaves nothing to train; give a number above 0."
-        )
-    return StagePlan(tuple(stages))
-
-
-def plan_seconds(configs: Sequence[StageConfig], max_train_seconds: float) -> StagePlan:
-    """Divide a run of ``max_train_seconds`` into stages by their fractions; those of no time are left out.
-
-    Raises:
-        InputError: a stage has a number of iterations, or the fractions leave nothing to train.
-    """
-    for config in configs:
-        if config.num_iterations is not None:
-            raise InputError(
-                f"the {config.name} stage has num-iterations, and --max-train-seconds ends the run by the clock; "
-                "give the stage a fraction, or leave --max-train-seconds out."
-            )
-    weight = sum(config.fraction for config in configs)
-    if not weight > 0.0:
-        raise InputError("the stages' fractions add up to 0; give one of them a fraction above 0.")
-    stages: list[Stage] = []
-    end = 0.0
-    for config in configs:
-        if config.fraction > 0.0:
-            start, end = end, end + max_train_seconds * config.fraction / weight
-            stages.append(Stage(config, start, end, timed=True))
+        raise InputError(f"--max-num-iterations is {length}, which leaves nothing to train; give a number above 0.")
     return StagePlan(tuple(stages))

@@ -6,7 +6,7 @@ from clock_by_hand import Time, time_by_hand
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.models.schedule import Schedule, TrainingClock
-from hsi_sc_nerf.models.stages import StageConfig, plan_seconds, plan_stages
+from hsi_sc_nerf.models.stages import StageConfig, plan_stages
 
 CONFIGS = (StageConfig("a", 1.0, learn_after={"camera_opt": 0.5}), StageConfig("b", 3.0, lr_start=0.5, lr_end=0.02))
 
@@ -15,7 +15,7 @@ CONFIGS = (StageConfig("a", 1.0, learn_after={"camera_opt": 0.5}), StageConfig("
 def timed(monkeypatch):
     """Makes schedules of eight seconds, whose clock is the returned one."""
     time = time_by_hand(monkeypatch)
-    return time, lambda clock="wall": Schedule(plan_seconds(CONFIGS, 8.0), clock)
+    return time, lambda clock="wall": Schedule(plan_stages(CONFIGS, 8.0, timed=True), clock)
 
 
 def steps(schedule, time, seconds, first=0):
@@ -68,7 +68,7 @@ def test_a_step_that_outlasts_a_stage_does_not_skip_the_next(timed):
 
 
 def test_groups_begin_to_learn_by_the_clock():
-    first = plan_seconds(CONFIGS, 8.0).stages[0]
+    first = plan_stages(CONFIGS, 8.0, timed=True).stages[0]
     assert [first.learns("camera_opt", seconds) for seconds in (0.0, 0.99, 1.0, 1.9)] == [False, False, True, True]
 
 
@@ -122,7 +122,7 @@ def test_a_stage_that_was_complete_is_followed_by_the_next(timed):
     time.now += 2.5
     schedule.end_step(0)
     assert schedule.stage_complete
-    longer = Schedule(plan_seconds(CONFIGS, 16.0), "wall")
+    longer = Schedule(plan_stages(CONFIGS, 16.0, timed=True), "wall")
     longer.resume(schedule.state(), 1)
     assert [name for name, *_ in steps(longer, time, 1.0, first=1)] == ["b"] * 12
     assert [(stage.start, stage.end) for stage in longer.plan.stages] == [(0.0, 2.5), (2.5, 14.5)]
@@ -138,7 +138,9 @@ def test_seconds_and_iterations_do_not_go_on_from_each_other(timed):
 
 def test_timed_plans_that_cannot_be_are_refused():
     with pytest.raises(InputError, match="num-iterations"):
-        plan_seconds((StageConfig("a", 1.0, num_iterations=3),), 8.0)
+        plan_stages((StageConfig("a", 1.0, num_iterations=3),), 8.0, timed=True)
     with pytest.raises(InputError, match="add up to 0"):
-        plan_seconds((StageConfig("a", 0.0),), 8.0)
-    assert [stage.config.name for stage in plan_seconds((StageConfig("a", 0.0), CONFIGS[1]), 8.0).stages] == ["b"]
+        plan_stages((StageConfig("a", 0.0),), 8.0, timed=True)
+    assert [
+        stage.config.name for stage in plan_stages((StageConfig("a", 0.0), CONFIGS[1]), 8.0, timed=True).stages
+    ] == ["b"]

@@ -49,6 +49,7 @@ def test_impossible_plans_are_refused():
         plan_stages((StageConfig("a", 0.0), StageConfig("b", 0.0)), 5)
     with pytest.raises(InputError, match="nothing to train"):
         plan_stages((StageConfig("a", 1.0),), 0)
+    assert lengths(plan_stages((StageConfig("a", 0.5, num_iterations=10), StageConfig("b", 0.0)), 10)) == [10]
 
 
 def test_every_step_belongs_to_the_stage_that_covers_it():
