@@ -300,12 +300,12 @@ def pick(
         metadata: metadata of the frame to which the ray belongs; empty for none.
 
     Returns:
-        The surface point at the median depth (scene units), its opacity, and its spectrum, background included.
+        The surface point at the median depth on the ray as the model refines it (scene units), its opacity, and its
+        spectrum, background included.
     """
-    unit = direction / direction.norm()
     rays = RayBundle(
         origins=origin[None],
-        directions=unit[None],
+        directions=(direction / direction.norm())[None],
         pixel_area=torch.ones(1, 1),
         camera_indices=torch.zeros(1, 1, dtype=torch.long),
         metadata={"directions_norm": torch.ones(1, 1), **metadata},
@@ -314,8 +314,8 @@ def pick(
     model.eval()
     try:
         with torch.no_grad():
-            outputs = model(rays.to(model.device))
+            outputs = model(rays)
     finally:
         model.train(was_training)
-    depth, opacity, spectrum = (outputs[name][0].cpu() for name in ("depth", "accumulation", "spectral"))
-    return origin + unit * depth, float(opacity), spectrum
+    point = (rays.origins + rays.directions * outputs["depth"])[0]
+    return point.cpu(), float(outputs["accumulation"][0]), outputs["spectral"][0].cpu()

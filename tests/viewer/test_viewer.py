@@ -307,6 +307,19 @@ def test_a_click_shows_the_spectrum_of_its_pixel(attached, pipeline):
     assert server.pointer is None
 
 
+def test_a_picked_point_lies_on_the_ray_as_the_model_refines_it(pipeline, monkeypatch):
+    origin, direction, shift = torch.tensor([3.0, 0.0, 1.0]), torch.tensor([-3.0, 0.0, -1.0]), torch.ones(3) / 9.0
+
+    def move(rays):
+        rays.origins = rays.origins + shift
+
+    monkeypatch.setattr(pipeline.model.camera_optimizer, "apply_to_raybundle", move)
+    point = pick(pipeline.model, origin, direction, {})[0]
+    torch.testing.assert_close(
+        torch.linalg.cross(point - origin - shift, direction), torch.zeros(3), rtol=0, atol=1e-5
+    )
+
+
 def test_a_picked_ray_leaves_a_training_model_training(pipeline):
     pipeline.model.train()
     _, _, spectrum = pick(pipeline.model, torch.tensor([3.0, 0.0, 1.0]), torch.tensor([-3.0, 0.0, -1.0]), {})
