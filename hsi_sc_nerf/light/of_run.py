@@ -202,7 +202,8 @@ def light_of_run(
     views = observe_elements(elements, poses, renders.intrinsics, renders.distortion, sampler.masks, pixels, LIFT_M)
     if views.on_object.sum() < LEAST_VIEWS:
         raise InputError(
-            "too few pixels of the object fit its surface; look at masks and poses in the dataset's report."
+            "too few pixels of the object fit its surface and are measured in all bands; look at masks and poses in "
+            "the dataset's report, and in its calibration.json at the flags of each band."
         )
     turning = turning_elements(elements, poses[:, :3, :3], SMOOTHING_M, LIFT_M)
     white_m = white_place(centre_m, poses, white_height_m)

@@ -28,7 +28,7 @@ from hsi_sc_nerf.light.material import CONTACT_ERROR, CONTACT_M
 from hsi_sc_nerf.light.matte_views import HIGHLIT, LEAST_COSINE, matte_score, matte_views
 from hsi_sc_nerf.light.of_run import RunLight, light_of_run, shading_evidence
 from hsi_sc_nerf.models.trained_run import open_trained_run
-from hsi_sc_nerf.packed.cube import pack, write_packed_cube
+from hsi_sc_nerf.packed.cube import FLAGGED, pack, write_packed_cube
 from hsi_sc_nerf.packed.dataset import Container, open_packed
 
 TO_LAMP = np.array([-0.45, 0.3, 0.84]) / np.linalg.norm([-0.45, 0.3, 0.84])
@@ -312,6 +312,19 @@ def test_the_command_states_the_run_in_its_cloud(even, tmp_path):
     write_spectral_ply(tmp_path / "cloud.ply", upper_cloud(even, lit=False))
     MaterialCommand(tmp_path / "cloud.ply", Path("runs/ball/now/config.yml")).main(even.run)
     assert "run: runs/ball/now" in PlyData.read(str(tmp_path / "cloud-material.ply")).comments
+
+
+@pytest.mark.slow
+def test_a_band_that_no_pixel_has_is_not_taken_for_wrong_masks(even, monkeypatch):
+    reader = even.run.manager.train_pixel_sampler.reader
+    read = reader.read
+    monkeypatch.setattr(
+        reader,
+        "read",
+        lambda pixels: np.where(np.arange(factory.BANDS) == 3, FLAGGED, read(pixels)).astype(np.uint16),
+    )
+    with pytest.raises(InputError, match=r"all bands; .*calibration\.json at the flags"):
+        light_of_run(even.run, FACING)
 
 
 def test_a_cloud_of_other_bands_is_refused():
