@@ -80,21 +80,20 @@ class ObjectLight:
             The irradiance, and the standard deviation of its mean over the bands, which for a point just above the
             surface that the object stands on is that of the material times the irradiance.
         """
-        of_object = np.flatnonzero(self.elements.on_object)
-        right_angle_m = NORMAL_WEIGHT * self._spacing_m / np.sqrt(2.0)
+        of_object, spacing_m = np.flatnonzero(self.elements.on_object), self._spacing_m
+        right_angle_m = NORMAL_WEIGHT * spacing_m / np.sqrt(2.0)
         features = np.concatenate([self.elements.positions, right_angle_m * self.elements.normals], axis=1)[of_object]
         distance, nearest = cKDTree(features).query(
             np.concatenate([points_m, right_angle_m * normals], axis=1), min(NEIGHBOURS, len(features))
         )
         distance, nearest = distance.reshape(len(points_m), -1), of_object[nearest.reshape(len(points_m), -1)]
-        weights = 1.0 / (distance + 0.25 * self._spacing_m) ** 2
+        weights = 1.0 / (distance + 0.25 * spacing_m) ** 2
         weights /= weights.sum(axis=1, keepdims=True)
         result = np.empty((len(points_m), self.spectral.material.shape[1]), np.float32)
         for frame in np.unique(frames):
             rows = np.flatnonzero(frames == frame)
-            light, material = self.spectral.light, self.spectral.material
-            bounced = self.turning.bounced(light, material, np.array([frame]))[:, 0]
-            whole = self.turning.direct(light, int(frame)) + bounced
+            direct = self.turning.direct(self.spectral.light, int(frame))[:, None]
+            whole = (direct + self.turning.bounced(direct, self.spectral.material))[:, 0]
             result[rows] = np.einsum("nk,nkb->nb", weights[rows], whole[nearest[rows]])
         result = np.maximum(result, LEAST_IRRADIANCE)
         relative = np.sqrt((weights * self._relative_variance[nearest]).sum(axis=1))

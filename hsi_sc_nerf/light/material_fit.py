@@ -147,9 +147,10 @@ class MaterialFitting:
     def bounce(self) -> None:
         """Irradiance at the measurements by other elements, from the light and materials of now."""
         frames, which = np.unique(self.views.frame, return_inverse=True)
+        direct = np.stack([self.elements.direct(self.light, int(frame)) for frame in frames], axis=1)
         for _ in range(1 if self.bounced.any() else 2):
             material = self.materials(self.irradiance())
-            self.bounced = self.elements.bounced(self.light, material, frames)[self.views.element, which]
+            self.bounced = self.elements.bounced(direct, material)[self.views.element, which]
 
     def linearised(self) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m parameters"]]:
         """Relative residuals, and relative derivatives of the expected values by the light's parameters.

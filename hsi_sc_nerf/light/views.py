@@ -163,11 +163,10 @@ class TurningElements:
         return chamber[:, None] * light.chamber_colour + (lamps @ light.lamps)[:, None] * light.lamp_colour
 
     def bounced(
-        self, light: StationaryLight, material: Float[np.ndarray, "n bands"], frames: Int[np.ndarray, "some"]
-    ) -> Float[np.ndarray, "n some bands"]:
-        """Irradiance of all elements in some frames by each other, after up to `BOUNCES` diffuse reflections."""
-        direct = np.stack([self.direct(light, int(frame)).astype(np.float32) for frame in frames], axis=1)
-        material = material[:, None].astype(np.float32)
+        self, direct: Float[np.ndarray, "n frames bands"], material: Float[np.ndarray, "n bands"]
+    ) -> Float[np.ndarray, "n frames bands"]:
+        """Irradiance of all elements by each other, after up to `BOUNCES` diffuse reflections of `direct` light."""
+        direct, material = direct.astype(np.float32), material[:, None].astype(np.float32)
         arriving = np.zeros_like(direct)
         for _ in range(BOUNCES):
             leaving = (material * (direct + arriving)).reshape(len(direct), -1)

@@ -135,7 +135,8 @@ def post_on_lid():
     sides = elements.on_object & (np.abs(elements.normals[:, 2]) < 0.1)
     rows = []
     for frame, rotation in enumerate(parts.rotations):
-        lit = parts.direct(light, frame) + parts.bounced(light, material, np.array([frame]))[:, 0]
+        direct = parts.direct(light, frame)[:, None]
+        lit = (direct + parts.bounced(direct, material))[:, 0]
         facing_camera = sides & (elements.normals @ rotation[:, 2] > 0.35)
         seen = np.flatnonzero(facing_camera | (~elements.on_object & elements.shows_light))
         shown = (material * lit)[seen] * (1.0 + 0.005 * rng.standard_normal((len(seen), 1)))

@@ -48,7 +48,7 @@ def test_irradiance_sums_over_all_directions(ball, light, frame):
 
 def test_reflections_of_some_frames_are_those_of_each(ball, light):
     material, frames = np.random.default_rng(2).uniform(0.2, 0.9, (60, 2)), np.array([1, 4, 7])
-    found = ball.bounced(light, material, frames)
+    found = ball.bounced(np.stack([ball.direct(light, frame) for frame in frames], axis=1), material)
     for column, frame in enumerate(frames):
         direct = direct_of_all_directions(ball, light, frame)
         arriving = np.zeros_like(direct)
