@@ -13,6 +13,7 @@ chamber, few lamps, and irradiance 1 on the white reference.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 from functools import partial
 
@@ -95,14 +96,14 @@ def fit_light(
     fit = _LightFitting(elements, views, white_normal, np.zeros(3) if white_m is None else white_m)
     fit.converge()
     while len(fit.light.lamps) < MOST_LAMPS:
-        before = fit.state()
+        before = copy(fit)
         if not fit.add_lamp():
             break
         fit.converge()
         fit.unevenness = UNEVENNESS
         fit.converge()
         if fit.light.lamps.min() < LEAST_LAMP:
-            fit.restore(before)
+            fit = before
             break
     # The chamber explains only what no lamp explains.
     fit.unevenness = UNEVENNESS
@@ -136,17 +137,6 @@ class _LightFitting(MaterialFitting):
         self.white, self.white_m = white, white_m
         self.errors = SharedErrors(elements.cells[views.element])
         self.unevenness = UNEVENNESS_AT_FIRST
-
-    _STATE = ("light", "lamps", "weights", "scatter", "unevenness", "bounced", "precision")
-
-    def state(self) -> dict:
-        """What `restore` needs."""
-        return {name: getattr(self, name) for name in self._STATE}
-
-    def restore(self, state: dict) -> None:
-        """Go back to an earlier `state`."""
-        for name, value in state.items():
-            setattr(self, name, value)
 
     def converge(self, *, estimate_unevenness: bool = False) -> None:
         """Gauss-Newton with the present lamps; the chamber's unevenness is estimated as well on request."""

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import map_coordinates
+from scipy import ndimage
 
 from hsi_sc_nerf.findings import CERTAIN
 from hsi_sc_nerf.geometry.camera import unit_vectors
@@ -88,7 +88,7 @@ class Gloss:
     def highlight(self, normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """What the lamps add, interpolated between the cells."""
         column, line = normals[:, :2].T / CELL + HALF - 0.5
-        return map_coordinates(self.highlights, [line, column], order=1, mode="nearest")
+        return ndimage.map_coordinates(self.highlights, [line, column], order=1, mode="nearest")
 
 
 def find_gloss(
@@ -125,7 +125,7 @@ def find_gloss(
     highlights, left = _fit_highlights(column[cells], element, residuals, irradiance)
     # A normal's x and y turn by half of what the mirrored direction turns: dw = 4 cos dn, and dn = dx dy / cos.
     unit = 4.0 * CELL**2 / (np.pi * float(light.lamps.sum()))
-    errors = _cell_medians(cells, left)[known & ~near]
+    errors = ndimage.median(left, cells, np.flatnonzero(known & ~near))
     reflectance = unit * float(highlights.sum())
     noise = unit * float(errors.std() * np.sqrt(CORRELATED * len(in_highlights)))
     if reflectance < max(LEAST_REFLECTANCE, CERTAIN * noise):
@@ -179,17 +179,6 @@ def _fit_highlights(
 def _cells(normals: Float[np.ndarray, "m 3"]) -> Int[np.ndarray, "m"]:
     column, line = np.clip(np.floor(normals[:, :2].T / CELL).astype(int) + HALF, 0, 2 * HALF - 1)
     return line * 2 * HALF + column
-
-
-def _cell_medians(cells: Int[np.ndarray, "m"], values: Float[np.ndarray, "m"]) -> Float[np.ndarray, "cells"]:
-    """Median of the values in each cell; NaN where there are few."""
-    medians = np.full((2 * HALF) ** 2, np.nan)
-    order = np.argsort(cells, kind="stable")
-    found, first, count = np.unique(cells[order], return_index=True, return_counts=True)
-    for cell, start, number in zip(found, first, count, strict=True):
-        if number >= LEAST_MEASUREMENTS:
-            medians[cell] = np.median(values[order[start : start + number]])
-    return medians
 
 
 def _near_highlights(light: StationaryLight) -> Bool[np.ndarray, "cells"]:

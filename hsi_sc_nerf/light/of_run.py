@@ -79,17 +79,6 @@ class RunLight:
         """Whether the object stands above the disc on something of unknown size, whose shade is left out."""
         return _support_unknown(self.run.dataset)
 
-    def irradiance(
-        self, points_m: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, "n bands"], Float[np.ndarray, "n"]]:
-        """Irradiance at points of the object in the frames that see them most from the front, and its uncertainty.
-
-        These frames give the spectra of an exported cloud. For a point that no frame sees it is that of the first
-        frame.
-        """
-        frames, _, normals = self.frontal(points_m)
-        return self.light.irradiance(points_m, normals, np.maximum(frames, 0))
-
     def frontal(
         self, points_m: Float[np.ndarray, "n 3"]
     ) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n 2"], Float[np.ndarray, "n 3"]]:
@@ -167,7 +156,8 @@ def light_of_run(
 
     Example:
         >>> found = light_of_run(open_trained_run(Path("config.yml")), np.array([0.0, 0.0, 1.0]))
-        >>> irradiance, std = found.irradiance(cloud.points)
+        >>> frames, _, normals = found.frontal(cloud.points)  # those that gave the cloud's spectra
+        >>> irradiance, std = found.light.irradiance(cloud.points, normals, np.maximum(frames, 0))
     """
     wavelengths_nm = run.model.wavelengths_nm
     if known is not None:
