@@ -131,40 +131,20 @@ def _corner_rows(lower_cell: Int[Tensor, "n levels 3"], table_size: int) -> Int[
 
 def _corner_weights(fraction: Float[Tensor, "n 3"]) -> Float[Tensor, "n 8"]:
     """Trilinear weight of each corner."""
-    x, y, z = fraction.unbind(dim=-1)
-    xy_far, xz, yz = x * y, x * z, y * z
-    xyz = xy_far * z
-    return torch.stack(
-        [
-            1 - x - y - z + xy_far + xz + yz - xyz,
-            z - xz - yz + xyz,
-            y - xy_far - yz + xyz,
-            yz - xyz,
-            x - xy_far - xz + xyz,
-            xz - xyz,
-            xy_far - xyz,
-            xyz,
-        ],
-        dim=-1,
-    )
+    (near_x, near_y, near_z), (x, y, z) = (1.0 - fraction).unbind(dim=-1), fraction.unbind(dim=-1)
+    edges = [along_x * along_y for along_x in (near_x, x) for along_y in (near_y, y)]
+    return torch.stack([edge * along_z for edge in edges for along_z in (near_z, z)], dim=-1)
 
 
 def _corner_gradients(values: Float[Tensor, "n 8"], fraction: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     """Gradient of the trilinear interpolation of corner values with respect to the fraction."""
-    x, y, z = fraction.unbind(dim=-1)
-    near_z, step_z = values[:, 0::2], values[:, 1::2] - values[:, 0::2]  # (n, 4): corners 2 x + y
-    at_z = near_z + step_z * z[:, None]
-    step_y = at_z[:, 1::2] - at_z[:, 0::2]  # (n, 2): corners x
-    at_yz = at_z[:, 0::2] + step_y * y[:, None]
-    step_z_at_y = step_z[:, 0::2] + (step_z[:, 1::2] - step_z[:, 0::2]) * y[:, None]
-    return torch.stack(
-        [
-            at_yz[:, 1] - at_yz[:, 0],
-            step_y[:, 0] + (step_y[:, 1] - step_y[:, 0]) * x,
-            step_z_at_y[:, 0] + (step_z_at_y[:, 1] - step_z_at_y[:, 0]) * x,
-        ],
-        dim=-1,
-    )
+    corners, parts, gradients = values.view(-1, 2, 2, 2), fraction.unbind(dim=-1), []
+    for axis in range(3):
+        steps = corners.select(axis + 1, 1) - corners.select(axis + 1, 0)  # (n, 2, 2): corners of the other axes
+        first, second = parts[:axis] + parts[axis + 1 :]
+        ends = torch.lerp(steps[:, 0], steps[:, 1], first[:, None])
+        gradients.append(torch.lerp(ends[:, 0], ends[:, 1], second))
+    return torch.stack(gradients, dim=-1)
 
 
 def _scatter_to_table(
