@@ -22,7 +22,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.capture.session import is_session
-from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.errors import InputError, one_sentence
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.packed.dataset import PackedDataset, open_packed, transforms_path
@@ -75,17 +75,12 @@ class SpectralDataParser(DataParser):
     config: SpectralDataParserConfig
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
-        try:
-            return self._outputs(self._open(), split)
-        except InputError as error:
-            raise SystemExit(f"hsi-sc-nerf: {error}") from error
-
-    def _open(self) -> PackedDataset:
         data, box_m = self.config.data, self.config.object_box_m
-        if is_unprocessed(data):
-            data = process_session(data, processed_dir(data.resolve()), self.config.process)
-        dataset = open_packed(data)
-        return dataset if box_m is None else with_object_box(dataset, np.array(box_m))
+        with one_sentence():
+            if is_unprocessed(data):
+                data = process_session(data, processed_dir(data.resolve()), self.config.process)
+            dataset = open_packed(data)
+            return self._outputs(dataset if box_m is None else with_object_box(dataset, np.array(box_m)), split)
 
     def _outputs(self, dataset: PackedDataset, split: str) -> DataparserOutputs:
         num_frames = len(dataset.frames)

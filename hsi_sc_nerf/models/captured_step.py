@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -22,6 +21,8 @@ if TYPE_CHECKING:
 
 Result = tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]
 """Loss, its terms, metrics."""
+_Captured = tuple[torch.cuda.CUDAGraph, Result, tuple[Tensor | None, ...]]
+"""A graph, and where its result and the gradients lie: they hold until a graph is launched again."""
 _WARM_UP_PASSES = 3
 """Passes before a capture: libraries set themselves up in the first ones."""
 
@@ -42,15 +43,6 @@ def forward_and_backward(model: SpectralModel, rays: RayBundle, batch: Mapping[s
     loss.backward()
     detached = ({name: value.detach() for name, value in values.items()} for values in (losses, metrics))
     return (loss.detach(), *detached)  # type: ignore[return-value]
-
-
-@dataclass(frozen=True, eq=False)
-class _Captured:
-    """A graph, and where its results lie: they hold until a graph is launched again."""
-
-    graph: torch.cuda.CUDAGraph
-    result: Result
-    gradients: tuple[Tensor | None, ...]
 
 
 class CapturedSteps:
@@ -93,12 +85,12 @@ class CapturedSteps:
             self._steps[kind] = self._capture(inputs, seed)
         if sampler is not None:
             sampler._anneal, sampler._steps_since_update = anneal, 0 if proposals_learn else counter
-        captured = self._steps[kind]
+        graph, result, gradients = self._steps[kind]
         seed()
-        captured.graph.replay()
-        for parameter, gradient in zip(self._parameters, captured.gradients, strict=True):
+        graph.replay()
+        for parameter, gradient in zip(self._parameters, gradients, strict=True):
             parameter.grad = gradient
-        return captured.result
+        return result
 
     def _loaded(self, rays: RayBundle, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The inputs of the graphs of this many rays, with these values."""
@@ -149,4 +141,4 @@ class CapturedSteps:
         with torch.cuda.graph(graph, pool=self._pool):
             result = self._pass(inputs)
         self._pool = self._pool or graph.pool()
-        return _Captured(graph, result, tuple(parameter.grad for parameter in self._parameters))
+        return graph, result, tuple(parameter.grad for parameter in self._parameters)

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from hsi_sc_nerf.data.datamanager import SpectralDataManager
+from hsi_sc_nerf.evaluation.spectral_metrics import squared_error_map
 from hsi_sc_nerf.fields.occupancy_grid import HULL_MARGIN_M, grid_over
 from hsi_sc_nerf.geometry.camera import pixels_of
 from hsi_sc_nerf.models.spectral_model import SpectralModel
@@ -135,13 +136,11 @@ def clear_and_compare(
 def _squared_errors(
     model: SpectralModel, manager: SpectralDataManager, pixels: Int[np.ndarray, "count 3"]
 ) -> Float[torch.Tensor, "count"]:
-    """Squared error of the rendered reflectance of each training pixel, mean over its measured bands."""
+    """Squared error of each training pixel's rendered reflectance, mean over its measured bands; 0 without any."""
     rays, batch = manager.training_pixels(pixels)
     training = model.training
     spectral = model.eval()(rays)["spectral"]
     model.train(training)
-    squares = (spectral - batch["spectral"].to(spectral)).square()
-    if "valid" not in batch:
-        return squares.mean(dim=1)
-    valid = batch["valid"].to(squares.device)
-    return (squares * valid).sum(dim=1) / valid.sum(dim=1).clamp_min(1)
+    valid = batch["valid"][None].to(spectral.device) if "valid" in batch else None
+    # The pixels are an image of a single line.
+    return squared_error_map(spectral[None], batch["spectral"][None].to(spectral), valid)[0].nan_to_num()

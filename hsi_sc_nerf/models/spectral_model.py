@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.data.datamanager import FROM_CHECKPOINT
 from hsi_sc_nerf.data.dataparser import CAMERA_ROTATION
-from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.errors import InputError, one_sentence
 from hsi_sc_nerf.evaluation.spectral_metrics import metrics_of_regions, spectral_angle_mapper, spectral_rmse
 from hsi_sc_nerf.fields.camera_shading import REFRESH_EVERY
 from hsi_sc_nerf.fields.hash_grid import grid_for_dataset
@@ -116,7 +116,7 @@ class SpectralModelConfig(NerfactoModelConfig):
     use_same_proposal_network: tyro.conf.Fixed[bool] = False
 
     def __post_init__(self) -> None:
-        try:
+        with one_sentence():
             require_effects(self.effects)
             if self.num_proposal_iterations == 0 and not self.disable_scene_contraction:
                 raise InputError(
@@ -130,8 +130,6 @@ class SpectralModelConfig(NerfactoModelConfig):
                     "--pipeline.model.background last-sample needs values in all bands behind the object; take "
                     "--pipeline.model.head direct and --pipeline.model.num-proposal-iterations 2 with it."
                 )
-        except InputError as error:
-            raise SystemExit(f"hsi-sc-nerf: {error}") from error
 
 
 class SpectralModel(NerfactoModel):

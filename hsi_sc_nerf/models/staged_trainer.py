@@ -7,6 +7,7 @@ import math
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Literal, cast
 
@@ -14,7 +15,6 @@ import torch
 import yaml
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
 from nerfstudio.utils import writer
-from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
@@ -130,6 +130,8 @@ class StagedTrainer(Trainer):
     """
 
     config: StagedTrainerConfig
+    optimizers: GuardedOptimizers
+    pipeline: SpectralPipeline
     _loaded: Path | None
 
     @property
@@ -140,8 +142,6 @@ class StagedTrainer(Trainer):
     @training_state.setter
     def training_state(self, state: Literal["training", "paused", "completed"]) -> None:
         self._training_state, self._state_was_set = state, True
-    optimizers: GuardedOptimizers
-    pipeline: SpectralPipeline
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Check the settings, plan the stages, and set up as nerfstudio does."""
@@ -167,16 +167,11 @@ class StagedTrainer(Trainer):
         plain = not (config.mixed_precision or config.use_grad_scaler or config.log_gradients)
         plain = plain and config.capture_steps and not config.gradient_accumulation_steps
         if self.pipeline.device.type == "cuda" and plain:
-            self._captured = CapturedSteps(self._model, [p for group in self._trainable.values() for p in group])
+            self._captured = CapturedSteps(self._model, [*chain(*self.optimizers.parameters.values())])
 
     def setup_optimizers(self) -> GuardedOptimizers:
         """Optimisers that skip non-finite steps."""
-        optimizers = GuardedOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
-        self._trainable = {
-            group: [parameter for parameter in parameters if parameter.requires_grad]
-            for group, parameters in optimizers.parameters.items()
-        }
-        return optimizers
+        return GuardedOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
 
     @property
     def _model(self) -> SpectralModel:
@@ -186,7 +181,11 @@ class StagedTrainer(Trainer):
         """Train the remaining steps of the plan; nerfstudio would add ``max_num_iterations`` to a resumed run."""
         try:
             with one_sentence(), interruption.one_line(self._stopped), files_of_run(self.base_dir):
-                self._train()
+                if self._loaded is None or not self._keep_stage_of(self._loaded) or not self.schedule.complete:
+                    self.config = copy.copy(self.config)
+                    self.config.max_num_iterations = self.schedule.require_steps_left(self._start_step)
+                    with training_progress(self.schedule) as self._show_progress:
+                        super().train()
                 flush_logs()
             interruption.ignore_when_done()
         except TrainingDivergedError as error:
@@ -196,14 +195,6 @@ class StagedTrainer(Trainer):
         finally:
             with suppress(OSError):  # what went wrong before is told
                 flush_logs()
-
-    def _train(self) -> None:
-        if self._loaded is not None and self._keep_stage_of(self._loaded) and self.schedule.complete:
-            return
-        self.config = copy.copy(self.config)
-        self.config.max_num_iterations = self.schedule.require_steps_left(self._start_step)
-        with training_progress(self.schedule) as self._show_progress:
-            super().train()
 
     def _stopped(self) -> str:
         return stopped_run(self.config.get_checkpoint_dir())
@@ -241,8 +232,7 @@ class StagedTrainer(Trainer):
         if warning is not None:
             CONSOLE.print(f"[yellow]{escape(warning)}")
         if step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
-            for group, rate in rates.items():  # under the names of nerfstudio's own schedules
-                writer.put_scalar(name=f"learning_rate/{group}", scalar=rate, step=step)
+            writer.put_dict(name="learning_rate", scalar_dict=rates, step=step)  # as nerfstudio's schedules are named
         if self._captured is None or step % _GPU_PROGRESS_STEPS == 0:
             self._show_progress(step, float(metrics_dict["psnr"]))
         self.schedule.end_step(step)
@@ -269,7 +259,7 @@ class StagedTrainer(Trainer):
         """Freeze these parameter groups, and no others."""
         if frozen == self._frozen:
             return
-        for group, parameters in self._trainable.items():
+        for group, parameters in self.optimizers.parameters.items():
             for parameter in parameters:
                 parameter.requires_grad_(group not in frozen)
                 parameter.grad = None
@@ -313,7 +303,6 @@ class StagedTrainer(Trainer):
         self.save_checkpoint(self.step)
         super()._after_train()
 
-    @check_main_thread
     def save_checkpoint(self, step: int) -> None:
         """Write a checkpoint, then delete the older ones if the configuration says so.
 

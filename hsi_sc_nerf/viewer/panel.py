@@ -272,7 +272,7 @@ class SpectralPanel(torch.nn.Module):
             client.camera.position = position - behind * ahead
             client.camera.look_at = position + ahead
             client.camera.wxyz = rotation.wxyz
-            client.camera.fov = views.vertical_fov(view, aspect)
+            client.camera.fov = views.vertical_fov(aspect)
 
     def _switch_picking(self, checkbox: ViewerCheckbox) -> None:
         if checkbox.value:
@@ -309,7 +309,7 @@ def pick(
         pixel_area=torch.ones(1, 1),
         camera_indices=torch.zeros(1, 1, dtype=torch.long),
         metadata={"directions_norm": torch.ones(1, 1), **metadata},
-    )
+    ).to(model.device)
     was_training = model.training
     model.eval()
     try:

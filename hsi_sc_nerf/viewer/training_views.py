@@ -11,6 +11,7 @@ from hsi_sc_nerf.data.datamanager import SpectralDataset
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_angle_map
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, image_coordinates, in_camera_frame
 from hsi_sc_nerf.packed.cube import unpack
+from hsi_sc_nerf.packed.dataset import PackedDataset
 
 SAME_POSITION = 1e-4
 """Largest distance (scene units) at which the viewer's camera counts as that of a view."""
@@ -24,6 +25,7 @@ class TrainingViews:
 
     def __init__(self, dataset: SpectralDataset) -> None:
         self.dataset = dataset
+        self._packed: PackedDataset = dataset.metadata["dataset"]
         cameras = dataset.cameras.to("cpu")
         self.rotations: Float[Tensor, "views 3 3"] = cameras.camera_to_worlds[:, :, :3]
         self.centres: Float[Tensor, "views 3"] = cameras.camera_to_worlds[:, :, 3]
@@ -45,9 +47,9 @@ class TrainingViews:
         to_object = self.dataset.metadata["object_box"].mean(dim=0) - self.centres[view]
         return float(-to_object @ self.rotations[view][:, 2])
 
-    def vertical_fov(self, view: int, aspect: float) -> float:
+    def vertical_fov(self, aspect: float) -> float:
         """Vertical field of view (radians) of a window of the aspect ratio width / height that contains a view."""
-        lens, _ = self._lens(view)
+        lens = self._packed.intrinsics
         half_height = max(lens.h / 2.0 / lens.fl_y, lens.w / 2.0 / lens.fl_x / aspect)
         return 2.0 * float(np.arctan(half_height))
 
@@ -60,21 +62,13 @@ class TrainingViews:
             Reflectance of the nearest pixels of the rays within the view, which of its values are valid, and which of
             the rays are within the view.
         """
-        pixels, seen = frame_pixels(directions.cpu(), self.rotations[view], *self._lens(view))
+        packed = self._packed
+        distortion = tuple(packed.distortion.tolist())
+        pixels, seen = frame_pixels(directions.cpu(), self.rotations[view], packed.intrinsics, distortion)
         lines, samples = pixels[seen].numpy().T
         reflectance, valid = unpack(self.dataset.frames[view].cube()[lines, samples])
         device = directions.device
         return torch.from_numpy(reflectance).to(device), torch.from_numpy(valid).to(device), seen.to(device)
-
-    def _lens(self, view: int) -> tuple[PinholeIntrinsics, tuple[float, float, float, float]]:
-        camera = self.dataset.cameras[view]
-        lens = PinholeIntrinsics(
-            int(camera.width), int(camera.height), *(float(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy))
-        )
-        if camera.distortion_params is None:
-            return lens, (0.0, 0.0, 0.0, 0.0)
-        k1, k2, _, _, p1, p2 = camera.distortion_params.flatten().tolist()
-        return lens, (k1, k2, p1, p2)
 
 
 def frame_pixels(

@@ -185,7 +185,7 @@ def test_the_camera_stands_where_a_view_was_taken_and_sees_all_of_it(attached, p
     assert not seen[:, 30:].any()
     assert measured.shape == (24 * 24, 12)
     aspect = 0.5
-    half = math.tan(TrainingViews(pipeline.datamanager.train_dataset).vertical_fov(view, aspect) / 2.0)
+    half = math.tan(TrainingViews(pipeline.datamanager.train_dataset).vertical_fov(aspect) / 2.0)
     assert half * aspect == pytest.approx(float(frame.width / 2 / frame.fx))
 
 
