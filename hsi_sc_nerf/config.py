@@ -50,7 +50,8 @@ def _published_lr(step: int) -> float:
 
 def _method(
     method_name: str,
-    pipeline: SpectralPipelineConfig,
+    datamanager: SpectralDataManagerConfig,
+    model: SpectralModelConfig,
     optimizers: dict[str, OptimizerConfig],
     full_frame: StageConfig,
     masked: StageConfig,
@@ -63,7 +64,7 @@ def _method(
         steps_per_eval_batch=500,
         steps_per_eval_image=5000,
         steps_per_eval_all_images=20_000,
-        pipeline=pipeline,
+        pipeline=SpectralPipelineConfig(_target=pipeline_with_panel, datamanager=datamanager, model=model),  # type: ignore[arg-type]
         # Without schedules: the stages scale the learning rates.
         optimizers={name: {"optimizer": optimizer, "scheduler": None} for name, optimizer in optimizers.items()},
         machine=MachineConfig(device_type=default_device()),
@@ -80,11 +81,8 @@ def _method(
 hsi_sc_nerf = MethodSpecification(
     config=_method(
         "hsi-sc-nerf",
-        SpectralPipelineConfig(
-            _target=pipeline_with_panel,  # type: ignore[arg-type]
-            datamanager=SpectralDataManagerConfig(train_num_rays_per_batch=_BALANCED[RAYS]),
-            model=SpectralModelConfig(),
-        ),
+        SpectralDataManagerConfig(train_num_rays_per_batch=_BALANCED[RAYS]),
+        SpectralModelConfig(),
         {
             "fields": _adam(1.5e-2),
             "field_networks": MuonOptimizerConfig(),
@@ -105,41 +103,38 @@ hsi_sc_nerf = MethodSpecification(
 hsi_sc_nerf_paper = MethodSpecification(
     config=_method(
         "hsi-sc-nerf-paper",
-        SpectralPipelineConfig(
-            _target=pipeline_with_panel,  # type: ignore[arg-type]
-            datamanager=SpectralDataManagerConfig(
-                dataparser=SpectralDataParserConfig(scene="cameras"),
-                train_num_rays_per_batch=paper.RAYS_PER_BATCH,
-                eval_num_rays_per_batch=paper.RAYS_PER_BATCH,
-            ),
-            model=SpectralModelConfig(
-                head="direct",
-                effects="view_dependence",
-                background="last-sample",
-                supersample_outline=False,
-                angular_loss="cosine",
-                angular_loss_mult=paper.ANGULAR_LOSS_WEIGHT,
-                distortion_loss_mult=paper.DISTORTION_LOSS_WEIGHT,
-                near_plane=paper.NEAR_FAR[0],
-                far_plane=paper.NEAR_FAR[1],
-                disable_scene_contraction=False,
-                proposal_initial_sampler="piecewise",
-                num_proposal_iterations=2,
-                num_proposal_samples_per_ray=(256, 96),
-                num_nerf_samples_per_ray=48,
-                proposal_net_args_list=[
-                    {"hidden_dim": 16, "log2_hashmap_size": 17, "num_levels": 5, "max_res": size, "use_linear": False}
-                    for size in (128, 256)
-                ],
-                predict_normals=True,
-                match_resolution=False,
-                num_levels=paper.HASH_LEVELS,
-                max_res=paper.FINEST_GRID,
-                log2_hashmap_size=paper.LOG2_HASH_TABLE,
-                average_init_density=paper.INITIAL_DENSITY,
-                use_appearance_embedding=True,
-                camera_optimizer=PoseRefinementConfig(mode="free-discarded"),
-            ),
+        SpectralDataManagerConfig(
+            dataparser=SpectralDataParserConfig(scene="cameras"),
+            train_num_rays_per_batch=paper.RAYS_PER_BATCH,
+            eval_num_rays_per_batch=paper.RAYS_PER_BATCH,
+        ),
+        SpectralModelConfig(
+            head="direct",
+            effects="view_dependence",
+            background="last-sample",
+            supersample_outline=False,
+            angular_loss="cosine",
+            angular_loss_mult=paper.ANGULAR_LOSS_WEIGHT,
+            distortion_loss_mult=paper.DISTORTION_LOSS_WEIGHT,
+            near_plane=paper.NEAR_FAR[0],
+            far_plane=paper.NEAR_FAR[1],
+            disable_scene_contraction=False,
+            proposal_initial_sampler="piecewise",
+            num_proposal_iterations=2,
+            num_proposal_samples_per_ray=(256, 96),
+            num_nerf_samples_per_ray=48,
+            proposal_net_args_list=[
+                {"hidden_dim": 16, "log2_hashmap_size": 17, "num_levels": 5, "max_res": size, "use_linear": False}
+                for size in (128, 256)
+            ],
+            predict_normals=True,
+            match_resolution=False,
+            num_levels=paper.HASH_LEVELS,
+            max_res=paper.FINEST_GRID,
+            log2_hashmap_size=paper.LOG2_HASH_TABLE,
+            average_init_density=paper.INITIAL_DENSITY,
+            use_appearance_embedding=True,
+            camera_optimizer=PoseRefinementConfig(mode="free-discarded"),
         ),
         {
             **{name: _adam(paper.LEARNING_RATE) for name in ("fields", "field_networks", "proposal_networks")},

@@ -94,8 +94,6 @@ def of_shading():
 
 def refinement(mode, size):
     made = PoseRefinementConfig(mode=mode).setup(
-        num_cameras=3,
-        device="cpu",
         camera_to_world=POSE,
         frame_indices=np.array([0, 1, 3]),
         num_frames=4,

@@ -11,8 +11,8 @@ from contextlib import closing
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt16
-from scipy import ndimage, sparse
-from scipy.sparse.linalg import splu
+from scipy import ndimage
+from scipy.sparse.linalg import LaplacianNd, splu
 
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE
@@ -158,7 +158,8 @@ def inpaint(
     bands_by_pattern: dict[bytes, list[int]] = {}
     for band in np.flatnonzero(missing.any(axis=0) & ~nowhere):
         bands_by_pattern.setdefault(missing[:, band].tobytes(), []).append(int(band))
-    laplacian = _grid_laplacian(*image.shape[:2])
+    # The neighbours' sum minus their number, for the cells line by line.
+    laplacian = LaplacianNd(image.shape[:2], boundary_conditions="neumann", dtype=float).tosparse().tocsr()
     for bands in map(np.array, bands_by_pattern.values()):
         unknown = missing[:, bands[0]]
         rows = laplacian[unknown]
@@ -170,16 +171,3 @@ def inpaint(
 def _window_sum(values: Float[np.ndarray, "lines samples bands"], window: int) -> Float[np.ndarray, "..."]:
     means = ndimage.uniform_filter(values, (window, window, 1), mode="constant")
     return means * np.float32(window**2)
-
-
-def _grid_laplacian(lines: int, samples: int) -> sparse.csr_array:
-    """Number of neighbours minus the neighbours' sum, for the cells of a grid, line by line."""
-
-    def chain(length: int) -> sparse.dia_array:
-        degree = np.full(length, 2.0)
-        degree[[0, -1]] -= 1.0
-        return sparse.diags_array([degree, *[np.full(length - 1, -1.0)] * 2], offsets=[0, 1, -1])
-
-    return sparse.csr_array(
-        sparse.kron(chain(lines), sparse.eye_array(samples)) + sparse.kron(sparse.eye_array(lines), chain(samples))
-    )

@@ -14,7 +14,6 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import binary_erosion, binary_fill_holes
 from torch import Tensor, nn
 
-from hsi_sc_nerf.fields.ray_marching import sample_occupied
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
@@ -46,7 +45,7 @@ class OccupancyGrid(nn.Module):
     Example:
         >>> shape, cell = grid_over(aabb)
         >>> grid = OccupancyGrid(aabb, matter, solid)
-        >>> starts, ends = grid.sample(origins, directions, nears, fars, num_samples=16)
+        >>> grid.refresh_all(field.density_fn)
     """
 
     opacity: Tensor
@@ -63,17 +62,6 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("opacity", matter.float() - 1.0)
         self.register_buffer("_candidates", matter.flatten().nonzero()[:, 0], persistent=False)
         self.register_buffer("_solid", solid.flatten()[self._candidates], persistent=False)
-
-    def sample(
-        self,
-        origins: Float[Tensor, "rays 3"],
-        directions: Float[Tensor, "rays 3"],
-        nears: Float[Tensor, "rays"],
-        fars: Float[Tensor, "rays"],
-        num_samples: int,
-    ) -> tuple[Float[Tensor, "rays samples"], Float[Tensor, "rays samples"]]:
-        """Starts and ends of samples along rays; see `sample_occupied`."""
-        return sample_occupied(origins, directions, nears, fars, self.opacity, self.lower, self.cell, num_samples)
 
     def random_points(self, count: int) -> tuple[Float[Tensor, "count 3"], Bool[Tensor, "count"]]:
         """Points in cells that may hold matter, and whether they are in solid ones."""

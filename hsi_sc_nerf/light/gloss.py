@@ -115,7 +115,8 @@ def find_gloss(
     """
     if not len(light.lamps):
         return None
-    cells, near = _cells(normals), _near_highlights(light)
+    across, line = np.clip(np.floor(normals[:, :2].T / CELL).astype(int) + HALF, 0, 2 * HALF - 1)
+    cells, near = line * 2 * HALF + across, _near_highlights(light)
     known = np.bincount(cells, minlength=near.size) >= LEAST_MEASUREMENTS
     in_highlights = np.flatnonzero(known & near)
     if not len(in_highlights) or not (known & ~near).any():
@@ -174,11 +175,6 @@ def _fit_highlights(
         scatter = robust_std(left, least=SMALLEST)
         weights = np.maximum(tukey_weights(left, scatter), 1e-6)
     return highlights, left
-
-
-def _cells(normals: Float[np.ndarray, "m 3"]) -> Int[np.ndarray, "m"]:
-    column, line = np.clip(np.floor(normals[:, :2].T / CELL).astype(int) + HALF, 0, 2 * HALF - 1)
-    return line * 2 * HALF + column
 
 
 def _near_highlights(light: StationaryLight) -> Bool[np.ndarray, "cells"]:

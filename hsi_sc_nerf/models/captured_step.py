@@ -37,14 +37,6 @@ def forward_pass(model: SpectralModel, rays: RayBundle, batch: Mapping[str, Tens
         return functools.reduce(torch.add, losses.values()), losses, metrics
 
 
-def forward_and_backward(model: SpectralModel, rays: RayBundle, batch: Mapping[str, Tensor]) -> Result:
-    """Forward and backward pass; gradients are left in the parameters."""
-    loss, losses, metrics = forward_pass(model, rays, batch)
-    loss.backward()
-    detached = ({name: value.detach() for name, value in values.items()} for values in (losses, metrics))
-    return (loss.detach(), *detached)  # type: ignore[return-value]
-
-
 class CapturedSteps:
     """Steps by all that makes one step launch other operations than another.
 
@@ -106,15 +98,18 @@ class CapturedSteps:
         return inputs
 
     def _pass(self, inputs: Mapping[str, Tensor]) -> Result:
+        """Forward and backward pass; gradients are left in the parameters."""
         parts: dict[str, dict[str, Tensor]] = {"rays": {}, "metadata": {}, "batch": {}}
         for name, value in inputs.items():
             kind, _, key = name.partition("/")
             parts[kind][key] = value
         for parameter in self._parameters:
             parameter.grad = None
-        return forward_and_backward(
-            self._model, RayBundle(**parts["rays"], metadata=parts["metadata"]), parts["batch"]
-        )
+        rays = RayBundle(**parts["rays"], metadata=parts["metadata"])
+        loss, losses, metrics = forward_pass(self._model, rays, parts["batch"])
+        loss.backward()
+        detached = ({name: value.detach() for name, value in values.items()} for values in (losses, metrics))
+        return (loss.detach(), *detached)  # type: ignore[return-value]
 
     def _capture(self, inputs: Mapping[str, Tensor], seed: Callable[[], object]) -> _Captured:
         sampler = self._model.proposals

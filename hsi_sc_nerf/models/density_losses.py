@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hsi_sc_nerf.models.occupancy_sampler import OccupancySampler
 from hsi_sc_nerf.models.supersampling import parts_of_pixels
-from hsi_sc_nerf.packed.dataset import PackedDataset
 
 FREE_SPACE_WEIGHT = 0.01
 """Weight of the loss of matter above the support beside the object (docs/validation/surface.md)."""
@@ -41,12 +39,6 @@ def mean_free_space(
     (*_, weights), (*_, samples) = outputs["weights_list"], outputs["ray_samples_list"]
     heights = samples.frustums.get_positions()[..., 2] - support_height
     return free_space_loss(weights[..., 0], heights, _of_sampled_rays(sampler, outputs, free.to(weights))) / len(free)
-
-
-def support_softness(dataset: PackedDataset, object_box: Float[Tensor, "2 3"]) -> float:
-    """`SUPPORT_SOFTNESS_M` in scene units, in which the dataset's object has this box."""
-    base, top = object_box[:, 2].tolist()
-    return SUPPORT_SOFTNESS_M * (top - base) / float(np.ptp(dataset.object_box_m[:, 2]))
 
 
 def _of_sampled_rays(

@@ -19,6 +19,7 @@ from hsi_sc_nerf.fields.occupancy_grid import (
     grid_over,
     pixels_of_cells,
 )
+from hsi_sc_nerf.fields.ray_marching import sample_occupied
 from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
 
 
@@ -60,7 +61,8 @@ class OccupancySampler(Sampler):
         device = ray_bundle.origins.device
         with torch.no_grad():
             nears, fars = ray_bundle.nears[:, 0], ray_bundle.fars[:, 0]
-            starts, ends = self.grid.sample(ray_bundle.origins, ray_bundle.directions, nears, fars, count)
+            rays, grid = (ray_bundle.origins, ray_bundle.directions, nears, fars), self.grid
+            starts, ends = sample_occupied(*rays, grid.opacity, grid.lower, grid.cell, count)
         self.rays = None
         if device.type == "cpu" and not self.every_ray:
             met = (ends[:, -1] > nears).nonzero()[:, 0]

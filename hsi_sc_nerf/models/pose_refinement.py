@@ -58,8 +58,6 @@ class PoseRefinement(CameraOptimizer):
     """The measured poses as they are (mode off), and what all refinements have in common.
 
     Args:
-        num_cameras: number of training cameras.
-        device: where the parameters live.
         camera_to_world: pose of the first frame in scene units.
         frame_indices: position of each training camera's frame in the session, ascending.
         num_frames: frames of the session, held-out ones included.
@@ -72,8 +70,6 @@ class PoseRefinement(CameraOptimizer):
     def __init__(
         self,
         config: PoseRefinementConfig,
-        num_cameras: int,
-        device: torch.device | str,
         camera_to_world: Float[np.ndarray, "4 4"],
         frame_indices: Int[np.ndarray, "train"],
         num_frames: int,
@@ -82,8 +78,6 @@ class PoseRefinement(CameraOptimizer):
         # nerfstudio's own constructor refuses modes that it does not know.
         torch.nn.Module.__init__(self)
         self.config = config
-        self.num_cameras = num_cameras
-        self.device = device
 
     def corrections(
         self, frames: Int[Tensor, "*n"], rotations: Float[Tensor, "*n 3 3"], positions: Float[Tensor, "*n 3"]
@@ -141,10 +135,8 @@ class TurntableRefinement(PoseRefinement):
     twist_basis: Tensor
     axis_origin: Tensor
 
-    def __init__(
-        self, config: PoseRefinementConfig, num_cameras: int, device: torch.device | str, **turntable
-    ) -> None:
-        super().__init__(config, num_cameras, device, **turntable)
+    def __init__(self, config: PoseRefinementConfig, **turntable) -> None:
+        super().__init__(config, **turntable)
         axis_origin = np.asarray(turntable["axis_origin"])
         centred = np.array(turntable["camera_to_world"], dtype=np.float64)
         centred[:3, 3] -= axis_origin
@@ -156,7 +148,7 @@ class TurntableRefinement(PoseRefinement):
         for name, value in buffers.items():
             self.register_buffer(name, torch.as_tensor(value, dtype=torch.float32))
         self.camera_twist = torch.nn.Parameter(torch.zeros(3))
-        self.frame_angles = torch.nn.Parameter(torch.zeros(num_cameras))
+        self.frame_angles = torch.nn.Parameter(torch.zeros(len(turntable["frame_indices"])))
 
     def angle_corrections(self) -> Float[Tensor, "num_frames"]:
         """Correction of every frame's angle, radians; the mean over the training frames is zero."""
@@ -197,13 +189,11 @@ class TurntableRefinement(PoseRefinement):
 class DiscardedRefinement(PoseRefinement):
     """The paper's published code: nerfstudio's ``SO3xR3`` of the training views, reset when it is frozen."""
 
-    def __init__(
-        self, config: PoseRefinementConfig, num_cameras: int, device: torch.device | str, **turntable
-    ) -> None:
-        super().__init__(config, num_cameras, device, **turntable)
+    def __init__(self, config: PoseRefinementConfig, **turntable) -> None:
+        super().__init__(config, **turntable)
         of_training = torch.eye(turntable["num_frames"])[:, turntable["frame_indices"]]
         self.register_buffer("interpolation", of_training)
-        self.pose_adjustment = torch.nn.Parameter(torch.zeros(num_cameras, 6))
+        self.pose_adjustment = torch.nn.Parameter(torch.zeros(of_training.shape[1], 6))
 
     def corrections(
         self, frames: Int[Tensor, "*n"], rotations: Float[Tensor, "*n 3 3"], positions: Float[Tensor, "*n 3"]

@@ -35,7 +35,7 @@ from hsi_sc_nerf.models.backgrounds import make_background
 from hsi_sc_nerf.models.build_field import build_field, build_proposals
 from hsi_sc_nerf.models.chosen_effects import chosen_effects, require_effects
 from hsi_sc_nerf.models.compositing import BasisDecoder, SpectralRenderer
-from hsi_sc_nerf.models.density_losses import FREE_SPACE_WEIGHT, mean_distortion, mean_free_space, support_softness
+from hsi_sc_nerf.models.density_losses import FREE_SPACE_WEIGHT, SUPPORT_SOFTNESS_M, mean_distortion, mean_free_space
 from hsi_sc_nerf.models.losses import angle_loss, angular_loss, hsi_loss
 from hsi_sc_nerf.models.occupancy_sampler import OccupancySampler, build_occupancy
 from hsi_sc_nerf.models.optimizers import with_network_group
@@ -171,7 +171,8 @@ class SpectralModel(NerfactoModel):
         else:
             grid = build_occupancy(dataset, metadata["frames"], self.scene_box.aabb, from_checkpoint)
             self.proposal_sampler = OccupancySampler(grid, config.num_nerf_samples_per_ray, config.predict_normals)
-        base, softness = metadata["object_box"][0, 2].item(), support_softness(dataset, metadata["object_box"])
+        base, top = metadata["object_box"][:, 2].tolist()
+        softness = SUPPORT_SOFTNESS_M * (top - base) / float(dataset.object_box_m[1, 2] - dataset.object_box_m[0, 2])
         self.support_height = None if dataset.container is None else base + softness
         self.object_base = base + softness / 2.0
         self.field = build_field(
@@ -187,12 +188,8 @@ class SpectralModel(NerfactoModel):
             turntable=metadata["turntable"],
             base=base,
         )
-        self.camera_optimizer = config.camera_optimizer.setup(
-            refine="pose_refinement" in self.effects,
-            num_cameras=self.num_train_data,
-            device="cpu",
-            **metadata["turntable"],
-        )
+        refine = "pose_refinement" in self.effects
+        self.camera_optimizer = config.camera_optimizer.setup(refine=refine, **metadata["turntable"])
         if contraction is None:
             self.collider = AABBBoxCollider(self.scene_box, near_plane=config.near_plane)  # type: ignore[assignment]
         else:

@@ -57,8 +57,6 @@ def rays_of(poses, frame):
 def refinement(poses, train, mode="turntable", refine=False):
     return PoseRefinementConfig(mode=mode).setup(
         refine=refine,
-        num_cameras=len(train),
-        device="cpu",
         camera_to_world=poses[0],
         frame_indices=np.array(train),
         num_frames=len(poses),
