@@ -63,7 +63,7 @@ class StageConfig:
     reach fade, so that the surface is smooth between the views' outlines."""
 
     def require_groups(self, known: Collection[str]) -> None:
-        """Refuse settings of a parameter group that is not among those known.
+        """Refuse settings of a parameter group that is not among those known, or with a rate of 0.
 
         Raises:
             InputError: there is such a setting.
@@ -72,6 +72,12 @@ class StageConfig:
             if group not in known:
                 raise InputError(
                     f"the {self.name} stage names the parameter group {group!r}; there are {', '.join(known)}."
+                )
+        for group, factors in self.group_lr.items():
+            if not min(factors) > 0.0:
+                raise InputError(
+                    f"the {self.name} stage's group-lr of {group} has a factor that is not above 0; "
+                    "frozen-groups keeps a group as it is."
                 )
 
 

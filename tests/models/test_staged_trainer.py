@@ -109,6 +109,7 @@ def test_normals_are_predicted_where_an_occupancy_grid_places_the_samples(tiny_d
         ({"full_frame": StageConfig("a", 1.0, learn_after={"table": 0.1})}, "group 'table'"),
         ({"full_frame": StageConfig("a", 1.0, foreground_ray_fraction=1.2)}, "--full-frame.foreground-ray-fraction"),
         ({"masked": StageConfig("b", -0.5)}, "--masked.fraction is -0.5"),
+        ({"masked": StageConfig("b", 1.0, group_lr={"fields": (0.0, 0.1)})}, "the b stage's group-lr of fields"),
         ({"masked": StageConfig("b", 1.0, lr_end=0.0)}, "--masked.lr-end is 0.0"),
         ({"machine": MachineConfig(num_devices=2)}, "trains on one device"),
         ({"machine": MachineConfig(num_machines=2)}, "trains on one device"),
