@@ -80,9 +80,12 @@ class ObjectLight:
             The irradiance, and the standard deviation of its mean over the bands, which for a point just above the
             surface that the object stands on is that of the material times the irradiance.
         """
-        of_object, spacing_m = np.flatnonzero(self.elements.on_object), self._spacing_m
+        of_object = np.flatnonzero(self.elements.on_object)
+        positions = self.elements.positions[of_object]
+        # The typical distance between neighbouring elements.
+        spacing_m = 2.0 * float(np.median(cKDTree(positions).query(positions, 2)[0][:, 1]))
         right_angle_m = NORMAL_WEIGHT * spacing_m / np.sqrt(2.0)
-        features = np.concatenate([self.elements.positions, right_angle_m * self.elements.normals], axis=1)[of_object]
+        features = np.concatenate([positions, right_angle_m * self.elements.normals[of_object]], axis=1)
         distance, nearest = cKDTree(features).query(
             np.concatenate([points_m, right_angle_m * normals], axis=1), min(NEIGHBOURS, len(features))
         )
@@ -103,23 +106,6 @@ class ObjectLight:
             relative = np.hypot(relative, CONTACT_ERROR * np.exp(-above_m / CONTACT_M))
         return result, relative * result.mean(axis=1)
 
-    def mirrored(
-        self, normals: Float[np.ndarray, "n 3"], frames: Int[np.ndarray, "n"]
-    ) -> tuple[Float[np.ndarray, "n bands"], Float[np.ndarray, "n"]] | None:
-        """What the skin mirrors into the camera in one frame each, as reflectance; None where no gloss was found.
-
-        Args:
-            normals: outward unit normals of the points, object frame.
-            frames: the frame that measured each point.
-
-        Returns:
-            The mirrored light, and the standard deviation of its mean over the bands.
-        """
-        if self.fit.gloss is None:
-            return None
-        in_camera = np.einsum("nk,nkj->nj", normals, self.turning.rotations[frames])
-        return self.fit.gloss.at(in_camera, self.spectral.light)
-
     def material_at(
         self,
         reflectance: Float[np.ndarray, "n selected"],
@@ -138,19 +124,14 @@ class ObjectLight:
             bands: of the light, at which the reflectance is given.
         """
         by_band, std = self.irradiance(points_m, normals, frames)
-        irradiance, mirrored, gloss = by_band.mean(axis=1), self.mirrored(normals, frames), None
-        if mirrored is not None:
-            added, added_std = mirrored
+        irradiance, gloss = by_band.mean(axis=1), None
+        if self.fit.gloss is not None:
+            in_camera = np.einsum("nk,nkj->nj", normals, self.turning.rotations[frames])
+            added, added_std = self.fit.gloss.at(in_camera, self.spectral.light)
             gloss, reflectance = added.mean(axis=1), np.maximum(reflectance - added[:, bands], SMALLEST)
             relative = np.nan_to_num(added_std / reflectance.mean(axis=1))  # 0 for a point without a spectrum
             std = np.hypot(std, irradiance * relative)
         return PointMaterial(reflectance / by_band[:, bands], irradiance, std, gloss)
-
-    @property
-    def _spacing_m(self) -> float:
-        """Typical distance between neighbouring elements of the object."""
-        positions = self.elements.positions[self.elements.on_object]
-        return float(np.median(cKDTree(positions).query(positions, 2)[0][:, 1])) * 2.0
 
     @property
     def _relative_variance(self) -> Float[np.ndarray, "elements"]:

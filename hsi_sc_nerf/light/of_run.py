@@ -85,9 +85,7 @@ class RunLight:
         """The frame that sees each point most from the front or -1, image coordinates there, and unit normals."""
         points = self.run.to_scene(points_m)
         normals = self.mesh.normals_at(points)
-        device = self.renders.camera_to_world.device
-        where, outward = (torch.from_numpy(array).float().to(device) for array in (points, normals))
-        frames, xy_px, _ = self.renders.most_frontal(where, outward)
+        frames, xy_px, _ = self.renders.most_frontal(*_beside(self.renders, points, normals))
         return frames.cpu().numpy(), xy_px.cpu().numpy(), normals
 
     def material(
@@ -112,12 +110,8 @@ class RunLight:
         if gloss is not None:
             in_camera = np.einsum("nk,nkj->nj", normals, self.light.turning.rotations[frames])
             rows = np.flatnonzero(seen & (gloss.highlight(in_camera) > HIGHLIT))
-            device = self.renders.camera_to_world.device
-            where, outward = (
-                torch.from_numpy(array).float().to(device)
-                for array in (self.run.to_scene(points_m[rows]), normals[rows])
-            )
-            others, xy_px = (column.cpu().numpy() for column in matte_views(self.renders, gloss, where, outward))
+            there = _beside(self.renders, self.run.to_scene(points_m[rows]), normals[rows])
+            others, xy_px = (column.cpu().numpy() for column in matte_views(self.renders, gloss, *there))
             better = (others >= 0) & (others != frames[rows])
             rows, reflectance = rows[better], reflectance.copy()
             frames[rows] = others[better]
@@ -211,11 +205,15 @@ def seen_part(mesh: SurfaceMesh, renders: DepthRenders) -> SurfaceMesh:
     """The triangles that some frame sees. Fusion also leaves a shell inside the object, at the truncation
     distance."""
     middles = mesh.vertices[mesh.triangles].mean(axis=1)
-    device = renders.camera_to_world.device
-    where, outward = (torch.from_numpy(array).float().to(device) for array in (middles, mesh.facet_normals()))
-    triangles = mesh.triangles[(renders.most_frontal(where, outward)[0] >= 0).cpu().numpy()]
+    frames, *_ = renders.most_frontal(*_beside(renders, middles, mesh.facet_normals()))
+    triangles = mesh.triangles[(frames >= 0).cpu().numpy()]
     used, corners = np.unique(triangles, return_inverse=True)
     return SurfaceMesh(mesh.vertices[used], corners.reshape(-1, 3))
+
+
+def _beside(renders: DepthRenders, *arrays: np.ndarray) -> tuple[torch.Tensor, ...]:
+    """Arrays as tensors on the device of the renders."""
+    return tuple(torch.from_numpy(array).float().to(renders.camera_to_world.device) for array in arrays)
 
 
 @dataclass(frozen=True)
