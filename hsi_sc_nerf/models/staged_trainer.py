@@ -294,6 +294,9 @@ class StagedTrainer(Trainer):
             results = {"stage": name, "step": step, "checkpoint": kept.name, "results": metrics}
             write_json(kept.with_suffix(".json"), results)
         link_checkpoint(checkpoint_path(self.checkpoint_dir, step), kept.parent)
+        if self.config.save_only_latest_checkpoint:  # others are of an earlier run in this folder
+            for older in {*kept.parent.glob("step-*")} - {kept, kept.with_suffix(".json")}:
+                older.unlink()
         flush_logs()
 
     def _after_train(self) -> None:

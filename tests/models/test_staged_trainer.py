@@ -92,6 +92,19 @@ def test_what_a_stage_says_holds_in_it_alone(tiny_dataset, tmp_path, monkeypatch
 
 
 @pytest.mark.slow
+def test_a_run_in_the_folder_of_an_earlier_one_leaves_its_own_stages_alone(tiny_dataset, tmp_path):
+    """Which stage ended when, and which checkpoint --load-dir takes, follow from the latest in the folder."""
+    for steps in (6, 4):
+        trainer(tiny_dataset, tmp_path, max_num_iterations=steps).train()
+    found = {f"{path.parent.name}/{path.name}" for path in tmp_path.rglob("*.ckpt")}
+    ends = {"full-frame": 1, "masked": 3}
+    assert found == {
+        *(f"stage-{name}/step-{step:09d}.ckpt" for name, step in ends.items()),
+        "nerfstudio_models/step-000000003.ckpt",
+    }
+
+
+@pytest.mark.slow
 def test_normals_are_predicted_where_an_occupancy_grid_places_the_samples(tiny_dataset, tmp_path):
     made = trainer(tiny_dataset, tmp_path, predict_normals=True, max_num_iterations=2)
     weights = made.pipeline.model.field.mlp_pred_normals.layers[0].weight
