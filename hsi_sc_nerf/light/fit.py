@@ -205,12 +205,10 @@ class _LightFitting(MaterialFitting):
         precision[:TERMS] = np.where(DEGREE_OF_TERM > 0, self.unevenness**-2.0, 0.0)
         precision[TERMS : TERMS + lamps] = LAMP_STD**-2.0
         precision[TERMS + lamps : TERMS + 3 * lamps] = TURN_STD_RAD**-2.0
-        if lamps:
-            precision[-1] = NEARNESS_STD**-2.0
+        nearness = slice(TERMS + 3 * lamps, None)  # of no lamps there is none
+        precision[nearness] = NEARNESS_STD**-2.0
         now = np.zeros(len(precision))
-        now[:TERMS], now[TERMS : TERMS + lamps] = light.chamber, light.lamps
-        if lamps:
-            now[-1] = light.nearness
+        now[:TERMS], now[TERMS : TERMS + lamps], now[nearness] = light.chamber, light.lamps, light.nearness
         of_chamber, of_lamps = unit_irradiance(self.white, light.to_lamps)
         nearer = relative_nearness(self.white_m[None], self.white[None], light.to_lamps)[0]
         factors = 1.0 + light.nearness * nearer
@@ -220,8 +218,7 @@ class _LightFitting(MaterialFitting):
         lit = light.lamps * factors * (light.to_lamps @ self.white > 0.0)
         white[TERMS + lamps : TERMS + 3 * lamps] = (lit[:, None] * (tangents(light.to_lamps) @ self.white)).ravel()
         by_lamps = float(of_lamps * factors @ light.lamps)
-        if lamps:
-            white[-1] = of_lamps * nearer @ light.lamps
+        white[nearness] = of_lamps * nearer @ light.lamps
         missing = 1.0 - of_chamber @ light.chamber - by_lamps
         # The light of a near lamp changes with the place twice as fast as the distance.
         std = np.hypot(WHITE_STD, 2.0 * light.nearness * by_lamps * WHITE_PLACE_STD_M)
