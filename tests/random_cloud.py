@@ -28,6 +28,7 @@ def assert_equal(read: SpectralCloud, written: SpectralCloud) -> None:
     np.testing.assert_array_equal(read.spectra[:, theirs], written.spectra[:, ours])
     for name in ("points", "normals", "colours"):
         np.testing.assert_array_equal(getattr(read, name), getattr(written, name))
+    assert read.metric == written.metric
     assert set(read.extra) == set(written.extra)
     for name, column in written.extra.items():
         np.testing.assert_array_equal(read.extra[name], column)

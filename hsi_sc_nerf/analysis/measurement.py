@@ -121,6 +121,8 @@ def measure_traits(
         raise InputError(f"two regions or classes are named {twice[0]}; give each region a name of its own.")
     config = on_container(MeshConfig() if mesh is None else mesh, dataset)
     cloud = one_piece(cloud, piece, config)
+    if dataset is not None and not dataset.metric:  # which another program's copy of a cloud does not say
+        cloud = replace(cloud, metric=False)
     picked = [RegionOfInterest(name, (x, y, z), radius) for name, (x, y, z, radius) in (regions or {}).items()]
     found_indices = find_indices(indices, cloud.wavelengths_nm)
     read = [one if isinstance(one, Calibration) else read_calibration(one) for one in calibrations]
@@ -150,7 +152,7 @@ def measure_traits(
         traits = analyse(surface, [*picked, *drawn_regions], classes, pixel_m, maps, class_maps)
         unsupervised = find_components(surface, components) if components else None
     settings = {**asdict(config), "splits": splits, "max_incidence_deg": max_incidence_deg}
-    if dataset is not None and not dataset.metric:
+    if not cloud.metric:
         settings["metric"] = False
     return Measurement(surface, size_of(closed), uncertainty, traits, unsupervised, settings)
 

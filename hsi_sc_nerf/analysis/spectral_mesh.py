@@ -55,6 +55,7 @@ class SpectralMesh:
         lit: reflectance as measured and the light that it was measured in, where the cloud tells the two apart.
         scatter: standard deviation of a vertex's measured reflectance, mean over bands, by how much frames disagree;
             NaN where fewer than two frames see it. None if the cloud does not tell.
+        metric: whether lengths are metres; else nothing gave the scale.
     """
 
     mesh: Mesh
@@ -63,6 +64,7 @@ class SpectralMesh:
     seen: Bool[np.ndarray, "v"]
     lit: LitSpectra | None = None
     scatter: Float[np.ndarray, "v"] | None = None
+    metric: bool = True
 
     @cached_property
     def areas_m2(self) -> Float[np.ndarray, "v"]:
@@ -125,7 +127,7 @@ def with_spectra(
         with np.errstate(divide="ignore", invalid="ignore"):
             of_points = cloud.extra["spectral_std"] / np.sqrt(cloud.extra["views"])
         scatter = mean(of_points[:, None])[:, 0]
-    return SpectralMesh(mesh, spectra, cloud.wavelengths_nm, seen, lit, scatter)
+    return SpectralMesh(mesh, spectra, cloud.wavelengths_nm, seen, lit, scatter, cloud.metric)
 
 
 def write_spectral_mesh(path: Path, surface: SpectralMesh, extra: dict[str, Float[np.ndarray, "v"]]) -> None:
@@ -146,5 +148,5 @@ def write_spectral_mesh(path: Path, surface: SpectralMesh, extra: dict[str, Floa
     colours = to_8_bit(measured[:, nearest_bands(surface.wavelengths_nm, paper.PSEUDO_RGB_NM)])
     points, normals = mesh.vertices.astype(np.float32), mesh.vertex_normals().astype(np.float32)
     columns = {"seen": surface.seen.astype(np.float32), **extra}
-    cloud = SpectralCloud(points, normals, colours, measured, surface.wavelengths_nm, columns)
+    cloud = SpectralCloud(points, normals, colours, measured, surface.wavelengths_nm, columns, surface.metric)
     write_spectral_ply(path, cloud, mesh.triangles)

@@ -125,12 +125,12 @@ class Run:
         """
         found = render_cloud(self.trained, CloudOptions(num_points=num_points, **options), self.name)
         chunks = list(found.chunks)
-        arrays = {
-            name: np.concatenate([getattr(chunk, name) for chunk in chunks])
+        points, normals, colours, spectra = (
+            np.concatenate([getattr(chunk, name) for chunk in chunks])
             for name in ("points", "normals", "colours", "spectra")
-        }
+        )
         extra = {name: np.concatenate([chunk.extra[name] for chunk in chunks]) for name in found.extra_names}
-        return Cloud(**arrays, wavelengths_nm=found.wavelengths_nm, extra=extra)
+        return Cloud(points, normals, colours, spectra, found.wavelengths_nm, extra, found.metric)
 
     def spectra_at(
         self,

@@ -95,7 +95,8 @@ class MaterialCommand:
         corrected = self.correct == "always" or (self.correct == "auto" and found.evidence.shaded)
         result = with_material(cloud, found, run.model.wavelengths_nm, corrected=corrected)
         told = light_summary(found, result, corrected=corrected, light_from=self.light)
-        write_cloud(stem, replace(stream(result), run=run_name(self.load_config)), file_format)
+        written = replace(stream(result), run=run_name(self.load_config), metric=run.dataset.metric)
+        write_cloud(stem, written, file_format)
         write_json(output.with_suffix(".json"), told)
         console = Console(soft_wrap=True, highlight=False)
         for line in sentences(told):

@@ -118,7 +118,8 @@ class SampleCommand:
             )
         name = run_name(self.load_config)
         added = None if material is None else material.at(points_m)
-        write_sampled_ply(output, given, found, wavelengths_nm, run.model.rgb_bands, name, added)
+        rgb_bands, metric = run.model.rgb_bands, run.dataset.metric
+        write_sampled_ply(output, given, found, wavelengths_nm, rgb_bands, name, added, metric)
         console = Console()
         if no_spectrum:
             console.print(

@@ -60,6 +60,8 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "gloss": ("1", "what the skin mirrors, as reflectance, mean over bands"),
 }
 """CF unit and meaning of each column that this package writes, the bands' apart."""
+_NO_SCALE = "unknown; lengths are in distances of the camera from the turntable's axis"
+_UNSCALED = dict.fromkeys("xyz", ("1", "position in the object frame, in distances of the camera from the axis"))
 _GEOMETRY = (*"xyz", *NORMALS)
 _MEASURED = {*COLUMNS} - {*_GEOMETRY, *COLOURS}
 _BAND_NAME = re.compile(r"scalar_(\d+(?:\.\d+)?)nm")
@@ -70,12 +72,13 @@ _MATERIAL_NAME = re.compile(r"material_\d+(?:\.\d+)?nm")
 class SpectralCloud:
     """Points with their spectra."""
 
-    points: Float[np.ndarray, "n 3"]  # metres
+    points: Float[np.ndarray, "n 3"]  # metres, where `metric`
     normals: Float[np.ndarray, "n 3"]
     colours: UInt8[np.ndarray, "n 3"]
     spectra: Float[np.ndarray, "n bands"]  # reflectance
     wavelengths_nm: Float[np.ndarray, "bands"]
     extra: dict[str, Float[np.ndarray, "n"]] = field(default_factory=dict)
+    metric: bool = True  # whether lengths are metres; else nothing gave the scale
 
     def __post_init__(self) -> None:
         columns = (self.points, self.normals, self.colours, self.spectra, *self.extra.values())
@@ -102,6 +105,7 @@ class CloudStream:
         extra_names: the chunks' extra columns, in order.
         chunks: the chunks, which are iterated over once.
         run: name of the run that made the cloud, which files state.
+        metric: whether lengths are metres, which files state as well.
     """
 
     count: int
@@ -109,12 +113,13 @@ class CloudStream:
     extra_names: tuple[str, ...]
     chunks: Iterable[SpectralCloud]
     run: str = ""
+    metric: bool = True
 
 
 def stream(cloud: SpectralCloud, chunk_points: int = CHUNK_POINTS) -> CloudStream:
     """A cloud in memory as a stream of views of it."""
     chunks = (cloud.select(slice(start, start + chunk_points)) for start in range(0, len(cloud), chunk_points))
-    return CloudStream(len(cloud), cloud.wavelengths_nm, tuple(cloud.extra), chunks)
+    return CloudStream(len(cloud), cloud.wavelengths_nm, tuple(cloud.extra), chunks, metric=cloud.metric)
 
 
 def oblique_note(cloud: SpectralCloud, name: str) -> str:
@@ -166,37 +171,46 @@ def run_name(load_config: Path) -> str:
     return "/".join(load_config.resolve().parent.parts[-3:])
 
 
-def cloud_attributes(run: str = "") -> dict[str, str]:
-    """Global attributes of a file; ``run`` is the name of the run, where one made the cloud."""
+def cloud_attributes(run: str = "", metric: bool = True) -> dict[str, str]:
+    """Global attributes of a file; ``run`` is the name of the run, where one made the cloud.
+
+    Where lengths are not ``metric``, the attribute ``scale`` says what they are.
+    """
     attributes = {
         "title": "spectral point cloud",
         "source": f"hsi-sc-nerf {__version__}",
         "references": "https://arxiv.org/abs/2602.16950",
         "comment": FRAME,
     }
-    return attributes | ({"run": run} if run else {})
+    return attributes | ({"run": run} if run else {}) | ({} if metric else {"scale": _NO_SCALE})
 
 
-def comment_lines(columns: Iterable[str], run: str = "") -> list[str]:
+def column_meanings(metric: bool) -> dict[str, tuple[str, str]]:
+    """`COLUMNS`, with the unit that positions have where they are not ``metric``."""
+    return COLUMNS if metric else COLUMNS | _UNSCALED
+
+
+def comment_lines(columns: Iterable[str], run: str = "", metric: bool = True) -> list[str]:
     """Attributes and the meaning of the columns as lines of text, in ASCII: ``x y z [m]: position ...``.
 
     Args:
         columns: names of the columns; those that have no stated meaning are left out.
         run: name of the run.
+        metric: whether lengths are metres.
 
     Example:
         >>> comment_lines(["views"])[-1]
         'views [1]: number of training frames that see the point'
     """
-    lines = [f"{name}: {value}" for name, value in cloud_attributes(run).items()]
+    lines = [f"{name}: {value}" for name, value in cloud_attributes(run, metric).items()]
     lines.append("bands [{}]: {}, one column a band, named by its centre in nm".format(*REFLECTANCE))
-    columns = tuple(columns)
+    columns, meanings = tuple(columns), column_meanings(metric)
     if any(name.startswith("material_") for name in columns):
         lines.append("material_ [{}]: {}".format(*MATERIAL))
     alike: dict[tuple[str, str], list[str]] = {}
     for name in columns:
-        if name in COLUMNS:
-            alike.setdefault(COLUMNS[name], []).append(name)
+        if name in meanings:
+            alike.setdefault(meanings[name], []).append(name)
     lines += [f"{' '.join(names)} [{unit}]: {meaning}" for (unit, meaning), names in alike.items()]
     return [" ".join(line.encode("ascii", "backslashreplace").decode().split()) for line in lines]
 
@@ -227,7 +241,7 @@ def write_spectral_ply(
     if len(set(names)) != len(names) or any(len(name.split()) != 1 for name in cloud.extra_names):
         raise ValueError(f"extra columns need one-word names that are not taken: {list(cloud.extra_names)}")
     properties = (f"property {'uchar' if name in COLOURS else 'float'} {name}" for name in names)
-    comments = (f"comment {line}" for line in comment_lines(names, cloud.run))
+    comments = (f"comment {line}" for line in comment_lines(names, cloud.run, cloud.metric))
     header = ["ply", "format binary_little_endian 1.0", *comments, f"element vertex {cloud.count}", *properties]
     faces = np.empty(0 if triangles is None else len(triangles), [("count", "u1"), ("corners", "<i4", 3)])
     if triangles is not None:
@@ -307,7 +321,8 @@ def read_spectral_ply(path: Path | str) -> SpectralCloud:
         204
     """
     path = Path(path)
-    vertices = read_ply(path)["vertex"].data
+    content = read_ply(path)
+    vertices = content["vertex"].data
     names = vertices.dtype.names
     bands = {name: float(match[1]) for name in names if (match := _BAND_NAME.fullmatch(name))}
     missing = [name for name in (*_GEOMETRY, *COLOURS) if name not in names]
@@ -330,4 +345,5 @@ def read_spectral_ply(path: Path | str) -> SpectralCloud:
             for name in names
             if name not in bands and name not in (*_GEOMETRY, *COLOURS)
         },
+        metric=f"scale: {_NO_SCALE}" not in content.comments,
     )

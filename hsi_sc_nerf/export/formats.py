@@ -120,7 +120,7 @@ def _write_las(path: Path, cloud: CloudStream) -> None:
     header = laspy.LasHeader(point_format=_LAS_POINT_FORMAT, version="1.4")
     header.scales = np.full(3, LAS_STEP_M)
     header.system_identifier, header.generating_software = "hyperspectral turntable", f"hsi-sc-nerf {__version__}"
-    text = "\n".join(comment_lines([*COLOURS, *cloud.extra_names], cloud.run))
+    text = "\n".join(comment_lines([*COLOURS, *cloud.extra_names], cloud.run, cloud.metric))
     header.vlrs.append(laspy.VLR("LASF_Spec", _LAS_TEXT_RECORD, "text area description", text.encode()))
     header.add_extra_dims([laspy.ExtraBytesParams(name, "f4") for name in names])
     with atomic_write(path) as (temporary,), laspy.open(str(temporary), mode="w", header=header) as writer:
@@ -137,7 +137,7 @@ def _write_las(path: Path, cloud: CloudStream) -> None:
 
 def _variables(cloud: CloudStream) -> Iterator[tuple[str, str, tuple[str, ...], dict[str, str]]]:
     """Name, type, dimensions and attributes of each variable as they stand in a file."""
-    for name, dtype, dimensions, attributes in table_variables(cloud.wavelengths_nm, cloud.extra_names):
+    for name, dtype, dimensions, attributes in table_variables(cloud):
         yield name, dtype, dimensions, attributes | (_PLACES if "wavelength" in dimensions else {})
 
 
@@ -159,7 +159,7 @@ def _write_netcdf(path: Path, cloud: CloudStream) -> None:
     with atomic_write(path) as (temporary,):
         _require_space(temporary, values + _NETCDF_BYTES)
         with h5netcdf.File(temporary, "w") as file:
-            file.attrs.update(table_attributes(cloud.run))
+            file.attrs.update(table_attributes(cloud.run, cloud.metric))
             file.dimensions = sizes
             wavelength = file.create_variable("wavelength", ("wavelength",), "<f8", data=cloud.wavelengths_nm)
             wavelength.attrs.update(WAVELENGTH_ATTRIBUTES)
@@ -183,7 +183,7 @@ def _write_zarr(path: Path, cloud: CloudStream) -> None:
     chunk_sizes = sizes | {"point": max(1, min(CHUNK_POINTS, cloud.count))}
     with atomic_write(path) as (temporary,):
         group = zarr.open_group(str(temporary), mode="w", zarr_format=3)
-        group.attrs.update(table_attributes(cloud.run))
+        group.attrs.update(table_attributes(cloud.run, cloud.metric))
 
         def create(name: str, dtype: str, dimensions: tuple[str, ...], attributes: Mapping[str, str]) -> Any:
             return group.create_array(

@@ -270,6 +270,7 @@ def write_sampled_ply(
     rgb_bands: list[int],
     run: str,
     material: tuple[Float[np.ndarray, "n bands"], Float[np.ndarray, "n"]] | None = None,
+    metric: bool = True,
 ) -> None:
     """Write a file with the spectra of its points as binary PLY, and normals and pseudo-RGB if it has none.
 
@@ -277,7 +278,8 @@ def write_sampled_ply(
     the new spectra they would be taken for theirs.
 
     Its comments state ``run``, the name of the run, and what the new columns mean. ``material`` is the reflectance of
-    the material, and the relative standard deviation of the light (`CloudMaterial.at`).
+    the material, and the relative standard deviation of the light (`CloudMaterial.at`), ``metric`` whether the run's
+    lengths are metres.
 
     Raises:
         InputError: the file cannot be written.
@@ -302,11 +304,11 @@ def write_sampled_ply(
     kept = {name: vertices[name] for name in vertices.dtype.names if name not in (*columns, *earlier)}
     vertex = ply_vertices(kept | columns)
     elements = [vertex if element.name == "vertex" else element for element in content.elements]
-    added = comment_lines([name for name in columns if name not in ("x", "y", "z")], run)
+    added = comment_lines([name for name in columns if name not in ("x", "y", "z")], run, metric)
     of_file = content.comments
     if earlier:
         outdated = comment_lines(map(own_name, earlier))
-        of_file = [line for line in of_file if line not in outdated and not line.startswith("run: ")]
+        of_file = [line for line in of_file if line not in outdated and not line.startswith(("run: ", "scale: "))]
     comments = [*of_file, *(line for line in added if line not in of_file)]
     with atomic_write(path) as (temporary,):
         file = PlyData(elements, byte_order="<", comments=comments, obj_info=content.obj_info)

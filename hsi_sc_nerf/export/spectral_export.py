@@ -68,7 +68,7 @@ def export_cloud(run: TrainedRun, output_dir: Path, options: CloudOptions, name:
     require_format(target, options.format, len(bands), len(EXTRA))
     cloud = render_cloud(run, options, name)
     path = write_cloud(target, cloud, options.format)
-    unit = "metres" if run.dataset.metric else "distances of the camera (nothing gave the scale), not the file's m"
+    unit = "metres" if run.dataset.metric else "distances of the camera (nothing gave the scale)"
     summary = f"{cloud.count:,} points with {len(bands)} bands, in {unit}: {escape(str(path))}"
     CONSOLE.print(f"[bold green]{summary}", soft_wrap=True)
     return path
@@ -104,7 +104,7 @@ def render_cloud(run: TrainedRun, options: CloudOptions, name: str = "") -> Clou
     if options.normal_method == "open3d":
         normals = estimate_normals(surface.points, surface.mesh_normals).astype(np.float32)
     chunks = _render_chunks(run, renders, surface, normals, bands, batch)
-    return CloudStream(len(surface), run.model.wavelengths_nm[bands], EXTRA, chunks, name)
+    return CloudStream(len(surface), run.model.wavelengths_nm[bands], EXTRA, chunks, name, run.dataset.metric)
 
 
 def _region(

@@ -3,12 +3,13 @@
 The dimensions are ``point`` and ``wavelength`` (nm). ``reflectance`` (point, wavelength), likewise ``material`` where
 the cloud has the material's columns; per point ``x y z`` (metres, object frame: a local frame, so that there is no
 grid mapping), ``nx ny nz``, ``red green blue`` and the other extra columns. Standard deviations are the
-``ancillary_variables`` of what they are of.
+``ancillary_variables`` of what they are of. Where nothing gave the scale, the attribute ``scale`` says so and
+positions have the unit 1.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,21 +18,22 @@ from jaxtyping import Shaped
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import (
     COLOURS,
-    COLUMNS,
     MATERIAL,
     NORMALS,
     REFLECTANCE,
+    CloudStream,
     SpectralCloud,
     band_property_names,
     cloud_attributes,
+    column_meanings,
     material_names,
+    stream,
 )
 
 if TYPE_CHECKING:
     import xarray  # an optional package
 
 WAVELENGTH_ATTRIBUTES = {"units": "nm", "long_name": "centre of the band", "standard_name": "radiation_wavelength"}
-_SPECTRAL = ("reflectance", "material")
 _ANCILLARY = {"reflectance": ("spectral_std", "sampled_std"), "irradiance": ("irradiance_std",)}
 """Standard deviations by the variable that they are of."""
 
@@ -56,11 +58,11 @@ def to_xarray(cloud: SpectralCloud, run: str = "") -> xarray.Dataset:
     columns = table_columns(cloud)
     variables = {
         name: (dimensions, columns[name].astype(dtype), attributes)
-        for name, dtype, dimensions, attributes in table_variables(cloud.wavelengths_nm, cloud.extra)
+        for name, dtype, dimensions, attributes in table_variables(stream(cloud))
     }
     positions = {axis: variables.pop(axis) for axis in "xyz"}
     wavelength = ("wavelength", np.asarray(cloud.wavelengths_nm, float), WAVELENGTH_ATTRIBUTES)
-    return xarray.Dataset(variables, positions | {"wavelength": wavelength}, table_attributes(run))
+    return xarray.Dataset(variables, positions | {"wavelength": wavelength}, table_attributes(run, cloud.metric))
 
 
 def from_xarray(table: xarray.Dataset) -> SpectralCloud:
@@ -92,16 +94,16 @@ def from_xarray(table: xarray.Dataset) -> SpectralCloud:
     points, normals, colours = (
         np.stack([table[name].values for name in names], axis=1) for names in ("xyz", NORMALS, COLOURS)
     )
-    return SpectralCloud(points, normals, colours, table["reflectance"].values, wavelengths_nm, extra)
+    metric = "scale" not in table.attrs
+    return SpectralCloud(points, normals, colours, table["reflectance"].values, wavelengths_nm, extra, metric)
 
 
-def table_variables(
-    wavelengths_nm: Shaped[np.ndarray, "bands"], extra_names: Iterable[str]
-) -> Iterator[tuple[str, str, tuple[str, ...], dict[str, str]]]:
+def table_variables(cloud: CloudStream) -> Iterator[tuple[str, str, tuple[str, ...], dict[str, str]]]:
     """Name, type, dimensions and attributes of each variable; the positions of points are coordinates."""
-    extra_names, meanings = tuple(extra_names), dict(zip(_SPECTRAL, (REFLECTANCE, MATERIAL), strict=True)) | COLUMNS
-    of_material = material_names(wavelengths_nm, extra_names)
-    spectral = _SPECTRAL if of_material else _SPECTRAL[:1]
+    extra_names = cloud.extra_names
+    meanings = {"reflectance": REFLECTANCE, "material": MATERIAL} | column_meanings(cloud.metric)
+    of_material = material_names(cloud.wavelengths_nm, extra_names)
+    spectral = ("reflectance", "material") if of_material else ("reflectance",)
     others = (name for name in extra_names if name not in of_material)
     for name in (*spectral, *"xyz", *NORMALS, *COLOURS, *others):
         attributes = dict(zip(("units", "long_name"), meanings.get(name, ()), strict=False))
@@ -127,6 +129,6 @@ def table_columns(cloud: SpectralCloud) -> dict[str, Shaped[np.ndarray, "n *band
     }
 
 
-def table_attributes(run: str) -> dict[str, str]:
+def table_attributes(run: str, metric: bool) -> dict[str, str]:
     """What a table says of itself."""
-    return {"Conventions": "CF-1.11", **cloud_attributes(run)}
+    return {"Conventions": "CF-1.11", **cloud_attributes(run, metric)}

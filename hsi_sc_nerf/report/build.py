@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -99,7 +99,7 @@ def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
     from hsi_sc_nerf.models.trained_run import open_trained_run
 
     run = open_trained_run(folder / "config.yml")
-    cloud = _cloud(run, folder, sources)
+    cloud = replace(_cloud(run, folder, sources), metric=run.dataset.metric)
     shown = object_section(cloud, sources.points, indices, calibrations)
     views, held_out, dataset = _rendered(run, sources.views), len(run.manager.eval_dataset), run.dataset
     scores, white = [view.scores for view in views], white_of(views)
@@ -136,6 +136,8 @@ def object_section(
         f"{len(shown.points)} of {len(cloud.points)} points. Spectra are kept as {len(spectra.basis)} components, "
         f"which changes reflectance by {spectra.rmse:.5f} (root mean square; at most {spectra.largest_error:.3f})."
     )
+    if not cloud.metric:
+        caption += " Lengths and areas are wrong: nothing gave the scale, and 1 m is the camera's distance."
     payload = cloud_payload(shown, spectra, indices, calibrations)
     blocks: list[Block] = [CloudViewer(payload, caption), *_class_tables(payload["classifiers"])]
     return Section("object", "The object", blocks, judge_cloud(cloud))

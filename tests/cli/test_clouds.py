@@ -39,11 +39,13 @@ def test_proposed_organs_are_written_and_measured(tmp_path, capfd):
 @pytest.mark.slow
 def test_where_nothing_differs_one_sentence_says_so(tmp_path, capfd):
     cloud = fruit_cloud(stem=SKIN, cap=SKIN, count=8000)
-    write_spectral_ply(tmp_path / "ball.ply", cloud.select(np.arange(8000)))
+    write_spectral_ply(tmp_path / "ball.ply", replace(cloud.select(np.arange(8000)), metric=False))
     TraitsCommand(tmp_path / "ball.ply", tmp_path, propose_regions=True, **COARSE).main()
     told = capfd.readouterr().err
     assert "body alone" in told
     assert f"no {INCIDENCE}" in told
+    assert not read_cloud(tmp_path / "mesh.ply").metric
+    assert json.loads((tmp_path / "traits.json").read_text())["settings"]["metric"] is False
     (body,) = json.loads((tmp_path / "regions_proposed.json").read_text())["regions"]
     assert len(body["points"]) == 8000
 

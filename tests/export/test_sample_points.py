@@ -241,6 +241,9 @@ def test_columns_that_another_run_measured_do_not_stay_beside_new_spectra(tmp_pa
     assert [line for line in comments if line.startswith("run: ")] == ["run: this/newer/run"]
     assert not any(line.startswith(("views [", "material_ [", "irradiance [")) for line in comments)
     assert any(line.startswith("x y z [m]") for line in comments)
+    assert read.metric
+    write_sampled_ply(written, read_points(written), found, new_nm, [1, 0, 0], "this/newer/run", metric=False)
+    assert not read_spectral_ply(written).metric
 
 
 TRIANGLE = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"

@@ -165,8 +165,10 @@ def test_a_region_with_hardly_any_surface_gives_what_it_has(run, tmp_path, tried
 
 
 def test_a_few_points_are_no_outliers_and_a_cloud_is_never_empty(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(run.dataset, "metric", False)
     path = export_cloud(run, tmp_path / "[bold]", CloudOptions(num_points=2))
     assert len(read_spectral_ply(path)) == 2
+    assert not read_spectral_ply(path).metric
     assert str(path) in capsys.readouterr().out
     monkeypatch.setattr(spectral_export, "statistical_inliers", lambda *_: np.zeros(0, int))
     with pytest.raises(InputError, match="every point counts as an outlier"):

@@ -20,9 +20,10 @@ def full_cloud():
 
 
 @pytest.mark.slow
-def test_a_table_in_memory_is_that_of_the_exported_file_and_comes_back_from_its_own(tmp_path):
+@pytest.mark.parametrize("metric", [True, False])
+def test_a_table_in_memory_is_that_of_the_exported_file_and_comes_back_from_its_own(tmp_path, metric):
     pytest.importorskip("h5netcdf")
-    cloud = full_cloud()
+    cloud = replace(full_cloud(), metric=metric)
     table = to_xarray(cloud, "pear/hsi-sc-nerf/now")
     exported = write_cloud(tmp_path / "cloud", replace(stream(cloud, 7), run="pear/hsi-sc-nerf/now"), "netcdf")
     table.to_netcdf(tmp_path / "own.nc", engine="h5netcdf")
@@ -30,6 +31,7 @@ def test_a_table_in_memory_is_that_of_the_exported_file_and_comes_back_from_its_
         with xarray.open_dataset(path, engine="h5netcdf") as read:
             xarray.testing.assert_identical(read.load(), table)
             assert_equal(from_xarray(read), cloud)
+            assert {read[name].units for name in "xyz"} == {"m" if metric else "1"}
 
 
 def test_names_and_units_are_those_of_cf():

@@ -164,3 +164,9 @@ def test_a_classifier_gives_each_point_its_class_and_each_class_its_area():
     (table,) = object_section(marked, 500, (), [replace(one, domain=None)]).blocks[1:]
     assert [row[1] for row in table.rows] == ["lower", "outside", WITHOUT_LIMITS]
     assert object_section(marked, 500).blocks[1:] == []
+
+
+@pytest.mark.parametrize("metric", [True, False])
+def test_a_page_without_a_scale_says_that_its_lengths_are_wrong(metric):
+    (viewer,) = object_section(replace(ball(), metric=metric), 500).blocks
+    assert ("nothing gave the scale" in viewer.caption) != metric
