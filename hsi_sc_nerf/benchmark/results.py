@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import math
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import cycle, islice
@@ -48,7 +50,8 @@ def table(runs: Sequence[BenchmarkRun]) -> tuple[list[str], list[list[str]]]:
     columns = _COLUMNS | (_GPU_COLUMN if on_gpu else {})
     rows = [
         [
-            column.format(**{"name": run.name, "setup_seconds": run.setup_seconds, **asdict(end), **end.metrics})
+            # A single band has no spectral angle.
+            column.format_map(defaultdict(lambda: math.nan, asdict(run) | asdict(end) | end.metrics))
             for column in columns.values()
         ]
         for run in runs
@@ -119,7 +122,7 @@ def draw_accuracy_and_time(path: Path, runs: Sequence[BenchmarkRun], clock: Cloc
         for run, colour, line in zip(runs, colours, lines, strict=True):
             ends = [point.ends_stage for point in run.checkpoints]
             seconds = [getattr(point, _SECONDS[clock]) for point in run.checkpoints]
-            curve = np.array([seconds, [point.metrics[metric] for point in run.checkpoints]])
+            curve = np.array([seconds, [point.metrics.get(metric, math.nan) for point in run.checkpoints]])
             axes.plot(*curve, color=colour, linestyle=line, label=run.name, marker="o", markersize=2.5)
             axes.plot(*curve[:, ends], "o", color=colour, markersize=7, fillstyle="none")
         if metric in _LOGARITHMIC:

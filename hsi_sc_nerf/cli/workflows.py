@@ -6,6 +6,7 @@ import json
 import math
 import shutil
 import time
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,7 +99,9 @@ class RunCommand(SessionSettings):
 def _show_results(out: Path, console: Console) -> None:
     """Print scores, sizes, warnings of the steps, and what to open."""
     results = json.loads((out / "eval.json").read_text(encoding="utf-8"))["results"]
-    scores = "SAM {sam:.4f} rad, RMSE {rmse:.4f}, SSIM {ssim:.3f}, PSNR {psnr:.1f} dB".format(**results)
+    scores = "SAM {sam:.4f} rad, RMSE {rmse:.4f}, SSIM {ssim:.3f}, PSNR {psnr:.1f} dB".format_map(
+        defaultdict(lambda: math.nan, results)  # a single band has no spectral angle
+    )
     console.print(f"Held-out views, inside the mask: {scores}")
     traits = json.loads((out / "traits" / "traits.json").read_text(encoding="utf-8"))
     if note := scale_note(each_object(traits)[0]):

@@ -109,9 +109,11 @@ def spectral_rmse(
 def spectral_angle_map(predicted: Image, target: Image, valid: Valid | None = None) -> Float[Tensor, "h w"]:
     """The angle between the spectra of each pixel, radians in [0, pi]; pi / 2 where either spectrum is zero.
 
-    NaN where a pixel has fewer than two valid bands.
+    NaN where a pixel has fewer than two valid bands, and so everywhere in images of a single band.
     """
     angles = torch.cat([spectral_angle(p, t) for p, t, _ in _blocks(predicted, target, valid)])
+    if predicted.shape[-1] < MIN_BANDS_OF_AN_ANGLE:
+        return torch.full_like(angles, torch.nan)
     return angles if valid is None else torch.where(has_angle(valid), angles, torch.nan)
 
 

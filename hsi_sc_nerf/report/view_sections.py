@@ -100,14 +100,22 @@ def views_section(views: Sequence[HeldOutView], held_out: int, white: float) -> 
             picture = to_8_bit(coloured(shown, drawn, colours).numpy())
             pictures[title] = embedded_array(picture, f"Map of the {title} of {view.scores.name}")
         sam, rmse = (view.scores.metrics[key] for key in ("sam", "rmse"))
-        scored = f"SAM {sam:.4f} rad, RMSE {rmse:.4f}" if np.isfinite(sam) else _NO_SCORE
+        scored = f"RMSE {rmse:.4f}" if np.isfinite(rmse) else _NO_SCORE
+        if np.isfinite(sam):
+            scored = f"SAM {sam:.4f} rad, {scored}"
         blocks.append(Figure(pictures, f"{view.scores.name}: {scored}.", columns=4))
     return Section("views", "Held-out views", blocks, judge_views([view.scores for view in views]))
 
 
 def judge_views(views: Sequence[ViewScores]) -> list[Finding]:
-    """The spectral angle of the held-out views that have one, without the noise of the measurement where known."""
-    views = [view for view in views if np.isfinite(view.metrics["sam"])]
+    """The spectral angle of the held-out views that have one, without the noise of the measurement where known.
+
+    Nothing where a single band was measured, which has no angle.
+    """
+    measured = [view for view in views if np.isfinite(view.metrics["rmse"])]
+    views = [view for view in measured if np.isfinite(view.metrics["sam"])]
+    if measured and not views:
+        return []
     if not views:
         sentence = "No held-out view shows anything of the object that was measured; look at the masks."
         return [Finding("spectral-angle", "red", sentence)]

@@ -229,6 +229,12 @@ def test_maps_are_nan_where_nothing_can_be_told() -> None:
     np.testing.assert_array_equal(errors.isnan(), valid.sum(-1) < 1)
 
 
+@pytest.mark.parametrize("valid", [None, torch.ones(H, W, 1, dtype=torch.bool)], ids=["all valid", "valid"])
+def test_a_single_band_has_no_angle_and_all_other_scores(valid: torch.Tensor | None) -> None:
+    found = metrics.spectral_metrics(*(image[..., :1] for image in pair()), blob(), valid)
+    assert {name for name, value in found.items() if math.isnan(value)} == {"sam"}
+
+
 def test_errors_of_valid_values_are_not_hidden() -> None:
     predicted, target = pair()
     valid = some_valid()

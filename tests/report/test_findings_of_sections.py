@@ -16,9 +16,9 @@ GROWING = 1000 + 30 * np.arange(8)
 """A part of a turn, from the narrow side of an object to the broad one."""
 
 
-def views(*angles_rad, noise_rad=np.nan):
+def views(*angles_rad, noise_rad=np.nan, rmse=None):
     return [
-        SimpleNamespace(name=f"pear_{i}", metrics={"sam": angle}, noise_angle_rad=noise_rad)
+        SimpleNamespace(name=f"pear_{i}", metrics={"sam": angle, "rmse": rmse or angle}, noise_angle_rad=noise_rad)
         for i, angle in enumerate(angles_rad)
     ]
 
@@ -63,6 +63,7 @@ def poses(px, used, *warnings):
         (judge_views(views(0.03, noise_rad=0.05)), ["green"], "0.000 beyond the noise"),
         (judge_views(views(np.nan, 0.04)), ["green"], "The mean spectral angle is 0.040"),
         (judge_views(views(np.nan, np.nan)), ["red"], "No held-out view"),
+        (judge_views(views(np.nan, rmse=0.01)), [], ""),  # of a single band
         (judge_bands(np.array([np.nan, np.nan]), NM[:2]), [], ""),
         (judge_bands(np.array([0.02, 0.04, np.nan]), NM[:3]), ["green"], "500 nm"),
         (judge_bands(np.array([0.08, 0.04]), NM[:2]), ["amber"], "400 nm"),
