@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from xml.etree import ElementTree
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from markupsafe import Markup
 from matplotlib import rc_context
 from matplotlib.axes import Axes
@@ -43,6 +43,7 @@ _SVG = "http://www.w3.org/2000/svg"
 _WIDTH_IN, _HEIGHT_IN, _LEGEND_ROW_IN = 4.8, 2.4, 0.2
 """A phone shows an inch in 76 px, so that letters are 9 px high."""
 _LEGEND_CHARACTERS = 54
+_DOT_PT = 4.0
 # Smallest value of a logarithmic axis as a fraction of the largest; a curve that touches 0 would use up all the axis.
 _SMALLEST_FRACTION = 1e-6
 
@@ -127,6 +128,13 @@ def line_chart(
                 label=curve.name or None,
                 gid="line",
             )
+            for alone in _alone(curve.y):  # which neither line nor band shows
+                for gid, reach, alpha in (("line", 0.0 * curve.y, 1.0), ("band", curve.spread, 0.22)):
+                    if reach is None:
+                        continue
+                    ends = np.maximum(curve.y[alone] + reach[alone] * np.array([-1.0, 1.0]), low)
+                    dot = axes.plot(curve.x[[alone, alone]], ends, color=colour, alpha=alpha, gid=gid)[0]
+                    dot.set(linewidth=_DOT_PT, solid_capstyle="round")
         if named:
             figure.legend(loc="outside upper left", ncols=columns, fontsize=9)
         axes.set(xlabel=x_label, ylabel=y_label)
@@ -134,6 +142,12 @@ def line_chart(
         _draw_marks(axes, marks or {})
         axes.margins(x=0.0)
         return _inline_svg(figure, alt)
+
+
+def _alone(values: Float[np.ndarray, "n"]) -> Int[np.ndarray, "alone"]:
+    """Indices of the values without another one beside them: all of a single band, or between gaps."""
+    known = np.pad(np.isfinite(values), 1)
+    return np.flatnonzero(known[1:-1] & ~known[:-2] & ~known[2:])
 
 
 def _value_range(values: Float[np.ndarray, "n"], from_zero: bool, logarithmic: bool) -> tuple[float, float]:

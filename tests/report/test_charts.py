@@ -60,6 +60,23 @@ def test_what_is_not_measured_is_a_gap_in_line_and_band():
     assert ">a</" in svg
 
 
+@pytest.mark.parametrize("spread", [None, np.full(1, 0.1)])
+def test_a_single_band_is_a_dot_with_a_bar_of_its_spread(spread):
+    svg = line_chart([Curve("", np.array([550.0]), np.array([0.4]), spread)], **LABELS)
+    dot = numbers(paths(svg, "line")[-1])
+    assert len(dot) == 2
+    np.testing.assert_array_equal(dot[0], dot[1])
+    if spread is not None:
+        bar = numbers(paths(svg, "band")[-1])
+        assert bar[:, 0].tolist() == dot[:, 0].tolist()
+        assert bar[:, 1].max() > dot[0, 1] > bar[:, 1].min()
+
+
+def test_a_value_between_gaps_is_a_dot():
+    svg = line_chart([Curve("", np.arange(4.0), np.array([1.0, np.nan, 2.0, np.nan]))], **LABELS)
+    assert [len(numbers(path)) for path in paths(svg, "line")[1:]] == [2, 2]
+
+
 def test_a_band_lies_around_its_line():
     x = np.arange(3.0)
     svg = line_chart([Curve("", x, np.ones(3), np.full(3, 0.5)), Curve("", x, np.zeros(3))], **LABELS)

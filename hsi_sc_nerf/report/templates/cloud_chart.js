@@ -45,6 +45,7 @@ function spectraChart(wavelengths, curves) {
       add("path", { class: "spread", fill: `var(--s${series})`, d });
     }
     add("path", { class: "line", stroke: `var(--s${series})`, d: `M${places(spectrum).join("L")}` });
+    if (spectrum.length === 1) add("circle", { fill: `var(--s${series})`, cx: x(first), cy: y(spectrum[0]), r: 3 });
   }
   return svg;
 }
