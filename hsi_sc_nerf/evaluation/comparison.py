@@ -23,7 +23,7 @@ from hsi_sc_nerf.evaluation.spatial import (
     threshold_curves,
 )
 from hsi_sc_nerf.geometry.camera import Similarity
-from hsi_sc_nerf.geometry.ply_file import ply_triangles, read_ply
+from hsi_sc_nerf.geometry.ply_file import is_metric, ply_triangles, read_ply
 from hsi_sc_nerf.settings_file import between, check_options
 
 Alignment = Literal["features", "icp", "none"]
@@ -72,12 +72,14 @@ class Reference:
         surface: metres.
         seen: which of the surface's points recall counts; None for all.
         align: how a cloud is aligned with it where the settings do not say.
+        metric: whether its lengths are metres; else nothing gave its scale.
     """
 
     name: str
     surface: Surface
     seen: Bool[np.ndarray, "n"] | None = None
     align: Alignment = "features"
+    metric: bool = True
 
 
 @dataclass(frozen=True)
@@ -127,8 +129,8 @@ def compare(
             simulated session.
 
     Raises:
-        InputError: a file or a setting cannot be used, the sizes do not fit together, or the shape is symmetric, so
-            that features do not determine its attitude.
+        InputError: a file or a setting cannot be used, the sizes do not fit together, one of the two has no scale, or
+            the shape is symmetric, so that features do not determine its attitude.
 
     Example:
         >>> found = compare(Path("point_cloud.ply"), read_reference(Path("scan.stl"), CompareConfig()))
@@ -144,6 +146,11 @@ def compare(
             "session where it is not given); choose one, such as --align icp."
         )
     cloud = surface_of(Path(cloud_path), config)
+    if not config.with_scale and _states_metres(Path(cloud_path)) != reference.metric:
+        raise InputError(
+            f"{cloud_path if reference.metric else reference.name}: nothing gave its scale, so that its lengths are "
+            "no metres; let the alignment change the size (--align features --with-scale)."
+        )
     _check_sizes(str(cloud_path), cloud, reference, alignment, config)
     registration = _register(str(cloud_path), cloud, reference, alignment, config, track)
     if registration is not None:
@@ -173,7 +180,12 @@ def read_reference(path: Path, config: CompareConfig) -> Reference:
         >>> len(read_reference(Path("point_cloud.ply"), CompareConfig()).surface.points_m)
         30
     """
-    return Reference(str(path), surface_of(path, config, METRES[config.reference_unit]))
+    surface = surface_of(path, config, METRES[config.reference_unit])
+    return Reference(str(path), surface, metric=_states_metres(path))
+
+
+def _states_metres(path: Path) -> bool:
+    return path.suffix.lower() != ".ply" or is_metric(read_ply(path))
 
 
 def surface_of(path: Path, config: CompareConfig, unit_m: float = 1.0) -> Surface:

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from hsi_sc_nerf import __version__
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write
-from hsi_sc_nerf.geometry.ply_file import read_ply
+from hsi_sc_nerf.geometry.ply_file import NO_SCALE, is_metric, read_ply
 
 CHUNK_POINTS = 1 << 15
 """Points of a chunk: 27 MB at 204 bands."""
@@ -60,7 +60,6 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "gloss": ("1", "what the skin mirrors, as reflectance, mean over bands"),
 }
 """CF unit and meaning of each column that this package writes, the bands' apart."""
-_NO_SCALE = "unknown; lengths are in distances of the camera from the turntable's axis"
 _UNSCALED = dict.fromkeys("xyz", ("1", "position in the object frame, in distances of the camera from the axis"))
 _GEOMETRY = (*"xyz", *NORMALS)
 _MEASURED = {*COLUMNS} - {*_GEOMETRY, *COLOURS}
@@ -182,7 +181,7 @@ def cloud_attributes(run: str = "", metric: bool = True) -> dict[str, str]:
         "references": "https://arxiv.org/abs/2602.16950",
         "comment": FRAME,
     }
-    return attributes | ({"run": run} if run else {}) | ({} if metric else {"scale": _NO_SCALE})
+    return attributes | ({"run": run} if run else {}) | ({} if metric else {"scale": NO_SCALE})
 
 
 def column_meanings(metric: bool) -> dict[str, tuple[str, str]]:
@@ -345,5 +344,5 @@ def read_spectral_ply(path: Path | str) -> SpectralCloud:
             for name in names
             if name not in bands and name not in (*_GEOMETRY, *COLOURS)
         },
-        metric=f"scale: {_NO_SCALE}" not in content.comments,
+        metric=is_metric(content),
     )

@@ -19,6 +19,8 @@ _SIZES = {
     **dict.fromkeys(("int", "uint", "float", "int32", "uint32", "float32"), 4),
     **dict.fromkeys(("double", "float64"), 8),
 }
+NO_SCALE = "unknown; lengths are in distances of the camera from the turntable's axis"
+"""What a file says of its ``scale`` where nothing gave it."""
 _ASCII_BYTES = 2
 """The shortest number of a text file and the blank behind it."""
 
@@ -76,6 +78,11 @@ def _check_counts(path: Path) -> None:
     claimed = sum(count * max(size, 1) for count, size in zip(counts, row_bytes, strict=True))
     if claimed > path.stat().st_size - len(header) + 1:
         raise ValueError("it is shorter than its header says")
+
+
+def is_metric(content: PlyData) -> bool:
+    """Whether lengths may be metres: no comment says that nothing gave the scale."""
+    return f"scale: {NO_SCALE}" not in content.comments
 
 
 def ply_vertices(columns: Mapping[str, Shaped[np.ndarray, "v"]]) -> PlyElement:

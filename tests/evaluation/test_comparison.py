@@ -6,6 +6,7 @@ import pytest
 import trimesh
 from PIL import Image
 from plyfile import PlyData, PlyElement
+from random_cloud import random_cloud
 
 from hsi_sc_nerf.cli.clouds import CompareCommand
 from hsi_sc_nerf.errors import InputError
@@ -14,6 +15,7 @@ from hsi_sc_nerf.evaluation.comparison import CompareConfig, Comparison, compare
 from hsi_sc_nerf.evaluation.comparison_report import write_comparison
 from hsi_sc_nerf.evaluation.registration import Registration, Rival
 from hsi_sc_nerf.evaluation.spatial import sample_surface, score_at
+from hsi_sc_nerf.export.cloud import write_spectral_ply
 from hsi_sc_nerf.geometry.camera import Similarity
 from hsi_sc_nerf.simulate.scores import seen_points, true_reference
 from hsi_sc_nerf.simulate.truth import load_truth
@@ -202,6 +204,15 @@ def test_a_folder_without_truth_and_a_cloud_too_thin_to_align(mesh: Path, sessio
     thin = write_cloud(tmp_path / "thin.ply", on_ball(20))
     with pytest.raises(InputError, match=r"thin\.ply: has 20 points, too few"):
         compared(thin, mesh, CompareConfig(points=500))
+
+
+def test_lengths_without_a_scale_are_compared_with_their_like_or_with_a_scale(mesh: Path, tmp_path: Path) -> None:
+    write_spectral_ply(tmp_path / "own.ply", random_cloud(200, metric=False))
+    own, config = tmp_path / "own.ply", CompareConfig(align="none", points=200)
+    for pair in ((own, mesh), (mesh, own)):
+        with pytest.raises(InputError, match=r"own\.ply: nothing gave its scale.*--with-scale"):
+            compared(*pair, config)
+    assert compared(own, own, config).to_reference_m.max() == 0.0
 
 
 def test_a_reference_of_one_point_is_told_to_be_too_small(mesh: Path, tmp_path: Path) -> None:
