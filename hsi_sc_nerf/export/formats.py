@@ -20,6 +20,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import (
     CHUNK_POINTS,
     COLOURS,
+    NORMALS,
     CloudStream,
     band_property_names,
     comment_lines,
@@ -120,7 +121,8 @@ def _write_las(path: Path, cloud: CloudStream) -> None:
     header = laspy.LasHeader(point_format=_LAS_POINT_FORMAT, version="1.4")
     header.scales = np.full(3, LAS_STEP_M)
     header.system_identifier, header.generating_software = "hyperspectral turntable", f"hsi-sc-nerf {__version__}"
-    text = "\n".join(comment_lines([*COLOURS, *cloud.extra_names], cloud.run, cloud.metric))
+    # LAS itself says what colours are: 16-bit numbers.
+    text = "\n".join(comment_lines([*"xyz", *NORMALS, *cloud.extra_names], cloud.run, cloud.metric))
     header.vlrs.append(laspy.VLR("LASF_Spec", _LAS_TEXT_RECORD, "text area description", text.encode()))
     header.add_extra_dims([laspy.ExtraBytesParams(name, "f4") for name in names])
     with atomic_write(path) as (temporary,), laspy.open(str(temporary), mode="w", header=header) as writer:

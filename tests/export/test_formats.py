@@ -21,7 +21,9 @@ def test_las_holds_everything_as_extra_bytes(tmp_path: Path) -> None:
     assert path.name == "cloud.las"
     (text,) = (vlr.record_data.decode().splitlines() for vlr in read.header.vlrs if vlr.record_id == 3)
     assert "run: pear/hsi-sc-nerf/now" in text
-    assert any(line.startswith("views [1]: ") for line in text)
+    for described in ("x y z [m]: ", "nx ny nz [1]: ", "views [1]: "):
+        assert any(line.startswith(described) for line in text)
+    assert not any("0 to 255" in line for line in text)
     assert read.header.generating_software.startswith("hsi-sc-nerf")
     np.testing.assert_allclose(read.xyz, written.points, atol=1e-6)
     np.testing.assert_array_equal(np.stack([read.red, read.green, read.blue], 1) // 257, written.colours)
