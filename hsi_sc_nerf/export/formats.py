@@ -53,7 +53,8 @@ def write_cloud(path_without_suffix: Path, cloud: CloudStream, file_format: Clou
     """Write a cloud, whole or not at all, and return its path (``.ply``, ``.las``, ``.nc``, ``.zarr``).
 
     Raises:
-        InputError: a package is missing, the format has no room for so many bands, or the file cannot be written.
+        InputError: a package is missing, the format has no room for so many bands or for a column's name, or the file
+            cannot be written.
 
     Example:
         >>> cloud = read_spectral_ply("point_cloud.ply")
@@ -61,6 +62,10 @@ def write_cloud(path_without_suffix: Path, cloud: CloudStream, file_format: Clou
         PosixPath('out/point_cloud.nc')
     """
     path = require_format(path_without_suffix, file_format, len(cloud.wavelengths_nm), len(cloud.extra_names))
+    if file_format in ("netcdf", "zarr"):
+        names = ["wavelength", *(name for name, *_ in table_variables(cloud))]
+        if odd := [name for name in names if "/" in name or names.count(name) > 1]:  # groups are separated by /
+            raise InputError(f"{path}: cannot hold a column named {odd[0]}; give it another name, without /.")
     writers: dict[CloudFormat, Callable[[Path, CloudStream], None]] = {
         "ply": write_spectral_ply,
         "las": _write_las,

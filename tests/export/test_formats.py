@@ -115,6 +115,15 @@ def test_a_full_disk_is_one_sentence_and_leaves_what_was_there(tmp_path, file_fo
     assert sum(file.stat().st_size for file in tmp_path.rglob("*")) == size
 
 
+@pytest.mark.parametrize("name", ["R550/R670", "reflectance", "wavelength"])
+@pytest.mark.parametrize("file_format", ["netcdf", "zarr"])
+def test_tables_refuse_a_column_that_would_not_come_back(tmp_path: Path, file_format, name: str) -> None:
+    pytest.importorskip({"netcdf": "h5netcdf", "zarr": "zarr"}[file_format])
+    with pytest.raises(InputError, match=rf"cloud\..* cannot hold a column named {name};"):
+        write_cloud(tmp_path / "cloud", stream(random_cloud(extra={name: np.ones(50)})), file_format)
+    assert not list(tmp_path.iterdir())
+
+
 def test_zarr_replaces_nothing_that_is_not_its_own(tmp_path: Path) -> None:
     pytest.importorskip("zarr")
     (tmp_path / "cloud.zarr").mkdir()
