@@ -125,6 +125,7 @@ def _write_las(path: Path, cloud: CloudStream) -> None:
     names = [*_LAS_NORMALS, *bands, *cloud.extra_names]
     header = laspy.LasHeader(point_format=_LAS_POINT_FORMAT, version="1.4")
     header.scales = np.full(3, LAS_STEP_M)
+    header.global_encoding.wkt = True  # which LAS asks of this point format, even without a coordinate system
     header.system_identifier, header.generating_software = "hyperspectral turntable", f"hsi-sc-nerf {__version__}"
     # LAS itself says what colours are: 16-bit numbers.
     text = "\n".join(comment_lines([*"xyz", *NORMALS, *cloud.extra_names], cloud.run, cloud.metric))
@@ -134,6 +135,8 @@ def _write_las(path: Path, cloud: CloudStream) -> None:
         for chunk in cloud.chunks:
             record = laspy.ScaleAwarePointRecord.zeros(len(chunk), header=header)
             record.x, record.y, record.z = np.asarray(chunk.points, np.float64).T
+            for name in ("return_number", "number_of_returns"):  # readers take 0 for damaged
+                record[name] = np.ones(len(chunk), np.uint8)
             for name, channel in zip(COLOURS, chunk.colours.T, strict=True):
                 record[name] = channel.astype(np.uint16) * _EIGHT_TO_SIXTEEN_BITS
             columns = [*chunk.normals.T, *chunk.spectra.T, *chunk.extra.values()]

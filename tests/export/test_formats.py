@@ -26,6 +26,9 @@ def test_las_holds_everything_as_extra_bytes(tmp_path: Path) -> None:
     assert not any("0 to 255" in line for line in text)
     assert read.header.generating_software.startswith("hsi-sc-nerf")
     np.testing.assert_allclose(read.xyz, written.points, atol=1e-6)
+    assert set(read.return_number) == set(read.number_of_returns) == {1}
+    assert read.header.number_of_points_by_return[0] == COUNT
+    assert read.header.global_encoding.wkt
     np.testing.assert_array_equal(np.stack([read.red, read.green, read.blue], 1) // 257, written.colours)
     for band, name in enumerate(BAND_NAMES):
         np.testing.assert_array_equal(read[name], written.spectra[:, band])
