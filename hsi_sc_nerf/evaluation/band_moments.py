@@ -30,10 +30,10 @@ BandScore = Float[np.ndarray, "masks bands"]
 def moment_scores(
     images: Images, masks: Bool[np.ndarray, "masks h w"]
 ) -> tuple[Int[np.ndarray, "masks bands"], BandScore, BandScore]:
-    """Scores over the valid pixels of each mask as one window.
+    """Scores over the valid pixels of each mask as one window; `spectral_metrics.band_arrays` gives the arguments.
 
     Returns:
-        Numbers of these pixels, mean squared error (0 without any pixel), and SSIM (1 without any).
+        Numbers of these pixels, mean squared error (paper, MSE_b; 0 without any pixel), and SSIM (1 without any).
     """
     means = np.zeros((2, len(masks), images[0].shape[2]))
     # Deviations from the means keep large offsets from cancelling.
@@ -47,9 +47,10 @@ def moment_scores(
 
 
 def windowed_scores(images: Images, masks: Bool[np.ndarray, "masks h w"]) -> BandScore:
-    """Mean SSIM of the Gaussian windows around the valid pixels of each mask; 1 without any.
+    """Mean SSIM of the Gaussian windows around the valid pixels of each mask (Wang et al. 2004); 1 without any.
 
-    Windows are cut at the image's borders, and values that are not valid are cut out of them.
+    What a window covers may lie outside the mask. At the image's border it is cut, values that are not valid are cut
+    out of it, and its weights are scaled to sum to 1.
     """
     from_middle = np.arange(SSIM_WINDOW_PX) - SSIM_WINDOW_PX // 2
     taps = np.exp(-0.5 * (from_middle / SSIM_WINDOW_SIGMA_PX) ** 2)

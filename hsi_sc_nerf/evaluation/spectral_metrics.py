@@ -34,7 +34,6 @@ BLOCK_VALUES = 1 << 20
 Image = Float[Tensor, "h w bands"]
 Mask = Bool[Tensor, "h w"]
 Valid = Bool[Tensor, "h w bands"]
-BandScore = Float[np.ndarray, "masks bands"]
 
 
 def spectral_metrics(
@@ -68,9 +67,10 @@ def metrics_of_regions(
     has_angles, number, has_any = None, None, None
     if valid is not None:
         has_angles, number, has_any = has_angle(valid), count_bands(valid), valid.any(-1)
-    masks = list(regions.values())
-    windowed = windowed_scores(predicted, target, masks, valid)
-    by_band = zip(*moment_scores(predicted, target, masks, valid), windowed, strict=True)
+    from hsi_sc_nerf.evaluation.band_moments import moment_scores, windowed_scores  # which losses do without
+
+    images = band_arrays(predicted, target, list(regions.values()), valid)
+    by_band = zip(*moment_scores(*images), windowed_scores(*images), strict=True)
     found: dict[str, float] = {}
     for (name, mask), (pixels, mse, similarity, windows) in zip(regions.items(), by_band, strict=True):
         counted = pixels > 0
@@ -147,30 +147,22 @@ def squared_error_map(predicted: Image, target: Image, valid: Valid | None = Non
     )
 
 
-def moment_scores(
-    predicted: Image, target: Image, masks: Sequence[Mask | None], valid: Valid | None = None
-) -> tuple[Int[np.ndarray, "masks bands"], BandScore, BandScore]:
-    """Valid pixels, mean squared error (paper, MSE_b) and SSIM of each band over each of several masks, float64.
-
-    SSIM takes means, variances and covariance over all the pixels of the mask: one window.
-    """
-    from hsi_sc_nerf.evaluation import band_moments  # compiles, which losses do without
-
-    return band_moments.moment_scores(*_arrays(predicted, target, masks, valid))
-
-
-def windowed_scores(
-    predicted: Image, target: Image, masks: Sequence[Mask | None], valid: Valid | None = None
-) -> BandScore:
-    """SSIM of each band over 11 x 11 Gaussian windows (sigma 1.5 px), float64: the usual index of Wang et al. 2004.
-
-    A window counts if its centre lies in the mask and is valid; what it covers may lie outside the mask. At the
-    image's border the window is cut, values that are not valid are cut out of it, and its weights are scaled to sum
-    to 1, so that every valid pixel is a centre.
-    """
-    from hsi_sc_nerf.evaluation import band_moments
-
-    return band_moments.windowed_scores(*_arrays(predicted, target, masks, valid))
+def band_arrays(
+    predicted: Image, target: Image, masks: Sequence[Mask | None], valid: Valid | None
+) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], Bool[np.ndarray, "masks h w"]]:
+    """The images and masks as `moment_scores` and `windowed_scores` take them, in the processor's memory."""
+    _check_shapes(predicted, target)
+    if valid is not None:
+        _check_valid(target, valid)
+    for mask in masks:
+        if mask is not None:
+            check_mask(predicted, mask)
+    precision = torch.float64 if torch.float64 in (predicted.dtype, target.dtype) else torch.float32
+    flags = torch.zeros(0, 0, 0, dtype=torch.bool) if valid is None else valid
+    images = (predicted.to(precision), target.to(precision), flags)
+    first, second, third = (image.contiguous().numpy(force=True) for image in images)
+    whole = torch.ones(predicted.shape[:2], dtype=torch.bool)
+    return (first, second, third), np.stack([(whole if mask is None else mask).numpy(force=True) for mask in masks])
 
 
 def decibel(mse: Float[np.ndarray, "*bands"]) -> Float[np.ndarray, "*bands"]:
@@ -224,24 +216,6 @@ def _blocks(
     else:
         for (p, t), v in zip(pairs, valid.split(step), strict=True):
             yield cleared(p, v), cleared(t, v), v
-
-
-def _arrays(
-    predicted: Image, target: Image, masks: Sequence[Mask | None], valid: Valid | None
-) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], Bool[np.ndarray, "masks h w"]]:
-    """The images and all masks as `band_moments` takes them, in the processor's memory."""
-    _check_shapes(predicted, target)
-    if valid is not None:
-        _check_valid(target, valid)
-    for mask in masks:
-        if mask is not None:
-            check_mask(predicted, mask)
-    precision = torch.float64 if torch.float64 in (predicted.dtype, target.dtype) else torch.float32
-    flags = torch.zeros(0, 0, 0, dtype=torch.bool) if valid is None else valid
-    images = (predicted.to(precision), target.to(precision), flags)
-    first, second, third = (image.contiguous().numpy(force=True) for image in images)
-    whole = torch.ones(predicted.shape[:2], dtype=torch.bool)
-    return (first, second, third), np.stack([(whole if mask is None else mask).numpy(force=True) for mask in masks])
 
 
 def _check_shapes(predicted: Tensor, target: Tensor) -> None:

@@ -12,11 +12,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from hsi_sc_nerf.evaluation.band_moments import moment_scores
 from hsi_sc_nerf.evaluation.chosen_views import spread_of_views
 from hsi_sc_nerf.evaluation.spectral_metrics import (
+    band_arrays,
     decibel,
     metrics_of_regions,
-    moment_scores,
     noise_angle,
     spectral_angle_map,
     squared_error_map,
@@ -121,7 +122,7 @@ def score_view(
     Args:
         noise_std: of the measured reflectance, by band.
     """
-    pixels, mse, ssim = (scores[0] for scores in moment_scores(rendered, measured, [mask], valid))
+    pixels, mse, ssim = (scores[0] for scores in moment_scores(*band_arrays(rendered, measured, [mask], valid)))
     mse, psnr_db, ssim = (np.where(pixels > 0, score, np.nan) for score in (mse, decibel(mse), ssim))
     noise_angle_rad = math.nan
     if noise_std is not None:

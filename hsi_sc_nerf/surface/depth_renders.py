@@ -177,9 +177,11 @@ def render_depth_maps(
         rays_per_batch: rays rendered at a time.
         max_rays: more pixels than this are rendered in cells of several pixels.
     """
+    from skimage.measure import block_reduce
+
     lines, samples = masks.shape[1:]
     cell_px = max(1, int(np.ceil(np.sqrt(masks.sum() / max_rays))))
-    mask_cells = _touched_cells(masks, cell_px)
+    mask_cells = block_reduce(masks, (1, cell_px, cell_px), np.max)  # which fills up the last ones with False
     cells = np.argwhere(np.stack([dilate(mask, 2 * MARGIN_CELLS + 1) for mask in mask_cells]))
     depths = torch.full(mask_cells.shape, torch.nan, device=model.device)
     points = [np.zeros((0, 3), np.float32)]
@@ -219,13 +221,3 @@ def refined_poses(model: SpectralModel, cameras: Cameras) -> Float[Tensor, "fram
     assert cameras.metadata is not None
     frames = cameras.metadata[FRAME_INDEX][:, 0].long().to(model.device)
     return model.camera_optimizer.corrected(frames, poses.to(model.device))
-
-
-def _touched_cells(
-    masks: Bool[np.ndarray, "frames lines samples"], cell_px: int
-) -> Bool[np.ndarray, "frames cells_down cells_across"]:
-    """Cells of ``cell_px`` x ``cell_px`` pixels that hold a pixel of the masks."""
-    frames, lines, samples = masks.shape
-    down, across = -(-lines // cell_px), -(-samples // cell_px)
-    padded = np.pad(masks, ((0, 0), (0, down * cell_px - lines), (0, across * cell_px - samples)))
-    return padded.reshape(frames, down, cell_px, across, cell_px).max(axis=(2, 4))
