@@ -15,13 +15,7 @@ from jaxtyping import Bool, Float, Int
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.registration import Registration, align_by_features, refine, robust_radius
-from hsi_sc_nerf.evaluation.spatial import (
-    Surface,
-    ThresholdCurves,
-    best_threshold_m,
-    sample_surface,
-    threshold_curves,
-)
+from hsi_sc_nerf.evaluation.spatial import Surface, ThresholdCurves, sample_surface, threshold_curves
 from hsi_sc_nerf.geometry.camera import Similarity
 from hsi_sc_nerf.geometry.ply_file import is_metric, ply_triangles, read_ply
 from hsi_sc_nerf.settings_file import between, check_options
@@ -104,11 +98,6 @@ class Comparison:
         """From 0 to the largest threshold."""
         thresholds_m = np.linspace(0.0, LARGEST_THRESHOLD_M, THRESHOLDS)
         return threshold_curves(self.to_reference_m, self.to_cloud_m, thresholds_m)
-
-    @cached_property
-    def best_threshold_m(self) -> float:
-        """The knee of the F-score's curve."""
-        return best_threshold_m(self.curves)
 
 
 def without_progress(items: Sequence[Any], _description: str) -> Iterable[Any]:
@@ -217,7 +206,15 @@ def read_surface(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, 
     if path.suffix.lower() not in FORMATS:
         raise InputError(f"{path}: cannot be compared; give a point cloud (PLY) or a mesh {FORMATS}.")
     try:
-        vertices, triangles = _read_ply(path) if path.suffix.lower() == ".ply" else _read_mesh(path)
+        if path.suffix.lower() == ".ply":
+            content = read_ply(path)  # mapped: only three of a spectral cloud's hundreds of columns are read
+            vertices = np.stack([np.asarray(content["vertex"][axis], float) for axis in "xyz"], axis=-1)
+            triangles = ply_triangles(content)
+        else:
+            import trimesh
+
+            mesh = trimesh.load_mesh(path, process=False)
+            vertices, triangles = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
     except InputError:
         raise
     except Exception as error:  # trimesh's readers raise errors of many types
@@ -229,20 +226,6 @@ def read_surface(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, 
     if not np.isfinite(vertices).all():
         raise InputError(f"{path}: some points have coordinates that are not finite; remove them or export it again.")
     return vertices, triangles
-
-
-def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    # Memory-mapped: only three of a spectral cloud's hundreds of columns are read.
-    content = read_ply(path)
-    vertices = np.stack([np.asarray(content["vertex"][axis], float) for axis in "xyz"], axis=-1)
-    return vertices, ply_triangles(content)
-
-
-def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    import trimesh
-
-    read = trimesh.load_mesh(path, process=False)
-    return np.asarray(read.vertices, float), np.asarray(read.faces, np.int64)
 
 
 def _check_sizes(

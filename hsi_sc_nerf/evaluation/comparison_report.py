@@ -15,13 +15,18 @@ from plyfile import PlyData
 
 from hsi_sc_nerf import __version__, paper
 from hsi_sc_nerf.evaluation.comparison import LARGEST_THRESHOLD_M, Comparison
-from hsi_sc_nerf.evaluation.spatial import ThresholdCurves, distance_statistics, score_at, threshold_for_m
+from hsi_sc_nerf.evaluation.spatial import (
+    ThresholdCurves,
+    best_threshold_m,
+    distance_statistics,
+    score_at,
+    threshold_for_m,
+)
 from hsi_sc_nerf.files import atomic_write, write_json
 from hsi_sc_nerf.geometry.ply_file import ply_vertices
 from hsi_sc_nerf.plotting import COLOURS, INDEX_COLOURS, STYLE, new_figure, save_figure
 from hsi_sc_nerf.terminal import markdown_table, markdown_text
 
-_SCORE_TITLES = ["threshold, mm", "precision, %", "recall, %", "F-score, %"]
 _STATISTICS = {
     "mean_m": "mean",
     "median_m": "median",
@@ -57,7 +62,8 @@ def comparison_tables(figures: Mapping[str, Any]) -> tuple[TextTable, TextTable]
         [key.replace("_", " "), *(f"{1000 * float(figures[key][statistic]):.3f}" for statistic in _STATISTICS)]
         for key in ("cloud_to_reference", "reference_to_cloud")
     ]
-    return (_SCORE_TITLES, scores), (["distance, mm", *_STATISTICS.values()], distances)
+    titles = ["threshold, mm", "precision, %", "recall, %", "F-score, %"]
+    return (titles, scores), (["distance, mm", *_STATISTICS.values()], distances)
 
 
 def comparison_summary(comparison: Comparison) -> dict[str, Any]:
@@ -69,7 +75,7 @@ def comparison_summary(comparison: Comparison) -> dict[str, Any]:
             name: {"threshold_m": threshold_m, **asdict(score_at(forth, back, threshold_m))}
             for name, threshold_m in (
                 ("chosen", comparison.config.threshold_m),
-                ("knee", comparison.best_threshold_m),
+                ("knee", best_threshold_m(comparison.curves)),
             )
         },
         "f_score_reaches": {
@@ -117,11 +123,7 @@ def write_comparison(folder: Path, comparison: Comparison, cloud_name: str, refe
     figures = comparison_summary(comparison)
     with atomic_write(*(folder / name for name in names)) as (page, numbers, curves, pictures, cloud):
         write_json(numbers, {"cloud": cloud_name, "reference": reference_name, **figures})
-        knee, chosen = (
-            (figures["scores"][name]["threshold_m"], figures["scores"][name]["f_score"])
-            for name in ("knee", "chosen")
-        )
-        _draw_curves(curves, comparison.curves, knee, chosen)
+        _draw_curves(curves, comparison.curves, figures["scores"])
         surfaces = [
             ("cloud", comparison.cloud.points_m, comparison.to_reference_m),
             ("reference", comparison.reference.points_m, comparison.to_cloud_m),
@@ -151,6 +153,18 @@ def _page(
         for percent in _REACHED_PERCENT
     )
     scores, distances = comparison_tables(figures)
+    nearest = [
+        f"to the nearest of {name}'s points" if surface.triangles is None else f"to {name}'s surface (triangles)"
+        for name, surface in (("the reference", comparison.reference), ("the cloud", comparison.cloud))
+    ]
+    seen = (
+        ""
+        if comparison.seen_fraction is None
+        else (
+            f" Recall counts the {100 * comparison.seen_fraction:.1f} % of the true surface that some view sees; "
+            "distances of the cloud are to all of it."
+        )
+    )
     return f"""# {markdown_text(cloud_name)} against {markdown_text(reference_name)}
 
 {markdown_table(*scores)}
@@ -160,7 +174,7 @@ from 0 to {1000 * LARGEST_THRESHOLD_M:g} mm.
 
 {markdown_table(*distances)}
 
-{_alignment_sentences(figures["alignment"])} {_distances_sentence(comparison)}{_seen_sentence(comparison)}
+{_alignment_sentences(figures["alignment"])} Distances are {" and ".join(nearest)}.{seen}
 
 ![Precision, recall and F-score over the distance threshold](curves.png)
 
@@ -192,30 +206,12 @@ def _alignment_sentences(alignment: dict[str, Any]) -> str:
     )
 
 
-def _distances_sentence(comparison: Comparison) -> str:
-    targets = [
-        f"to the nearest of {name}'s points" if surface.triangles is None else f"to {name}'s surface (triangles)"
-        for name, surface in (("the reference", comparison.reference), ("the cloud", comparison.cloud))
-    ]
-    return f"Distances are {targets[0]} and {targets[1]}."
-
-
-def _seen_sentence(comparison: Comparison) -> str:
-    if comparison.seen_fraction is None:
-        return ""
-    return (
-        f" Recall counts the {100 * comparison.seen_fraction:.1f} % of the true surface that some view sees; "
-        "distances of the cloud are to all of it."
-    )
-
-
 @rc_context(STYLE)
-def _draw_curves(path: Path, curves: ThresholdCurves, knee: tuple[float, float], chosen: tuple[float, float]) -> None:
+def _draw_curves(path: Path, curves: ThresholdCurves, scores: Mapping[str, Mapping[str, float]]) -> None:
     """Precision, recall and F-score over the threshold; the knee dashed, the chosen threshold dotted.
 
     Args:
-        knee: threshold (metres) and F-score (percent) of the curve's knee.
-        chosen: likewise of ``--threshold-m``, which may lie beyond the curves.
+        scores: of `comparison_summary`; the chosen threshold may lie beyond the curves.
     """
     figure = new_figure(6.0, 3.4)
     axes = figure.subplots()
@@ -223,15 +219,11 @@ def _draw_curves(path: Path, curves: ThresholdCurves, knee: tuple[float, float],
     drawn = {"precision": curves.precision, "recall": curves.recall, "F-score": curves.f_score}
     for (name, values), colour in zip(drawn.items(), COLOURS, strict=False):
         axes.plot(millimetres, values, color=colour, linewidth=2.2 if name == "F-score" else 1.3, label=name)
-    for (place_m, score), name, line in ((knee, "knee", "--"), (chosen, "chosen", ":")):
-        label = f"{name}: {1000 * place_m:.2f} mm, F-score {score:.1f} %"
-        axes.axvline(1000 * place_m, color="black", linestyle=line, linewidth=1.1, label=label)
-    axes.set(
-        xlabel="distance threshold (mm)",
-        ylabel="%",
-        xlim=(0, max(millimetres[-1], 1000 * chosen[0])),
-        ylim=(0, 102),
-    )
+    for name, line in (("knee", "--"), ("chosen", ":")):
+        place_mm = 1000 * scores[name]["threshold_m"]
+        label = f"{name}: {place_mm:.2f} mm, F-score {scores[name]['f_score']:.1f} %"
+        axes.axvline(place_mm, color="black", linestyle=line, linewidth=1.1, label=label)
+    axes.set(xlabel="distance threshold (mm)", ylabel="%", xlim=(0, max(millimetres[-1], place_mm)), ylim=(0, 102))
     axes.legend(loc="lower right")
     save_figure(figure, path)
 
