@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import (
+    CHUNK_POINTS,
     GLOSS,
     LIGHT_COLUMNS,
     SpectralCloud,
@@ -31,7 +32,6 @@ NEIGHBOURS = 4
 """Points of the cloud whose mean a point gets."""
 MAX_DISTANCE_M = 0.003
 """A point further from all of the cloud's has no known material."""
-_CHUNK_POINTS = 1 << 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +62,8 @@ class CloudMaterial:
         std = np.full(len(points_m), np.nan, np.float32)
         count = np.arange(1, min(NEIGHBOURS, len(self.points_m)) + 1)
         finite = np.flatnonzero(np.isfinite(points_m).all(axis=1))
-        for start in range(0, len(finite), _CHUNK_POINTS):
-            rows = finite[start : start + _CHUNK_POINTS]
+        for start in range(0, len(finite), CHUNK_POINTS):
+            rows = finite[start : start + CHUNK_POINTS]
             distance_m, nearest = self._tree.query(points_m[rows], count, workers=-1)
             near = distance_m[:, 0] <= MAX_DISTANCE_M
             rows, distance_m, nearest = rows[near], distance_m[near], nearest[near]

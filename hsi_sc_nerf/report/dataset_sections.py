@@ -160,12 +160,9 @@ def _values(dataset: PackedDataset) -> int:
 def _flagged_values(dataset: PackedDataset, found: Mapping[str, Any]) -> list[Figure]:
     """Curves of the values that were clipped or flagged in each band; empty if there are none."""
     of_band = _values(dataset) / len(dataset.wavelengths_nm)
-    fractions = {name: np.asarray(found.get(key, ()), float) / of_band for key, name in _FLAGGED.items()}
-    curves = [
-        Curve(name, dataset.wavelengths_nm, 100.0 * fraction)
-        for name, fraction in fractions.items()
-        if len(fraction) == len(dataset.wavelengths_nm) and fraction.any()
-    ]
+    percent = {name: 100.0 * np.asarray(found.get(key, ()), float) / of_band for key, name in _FLAGGED.items()}
+    nm = dataset.wavelengths_nm
+    curves = [Curve(name, nm, values) for name, values in percent.items() if len(values) == len(nm) and values.any()]
     if not curves:
         return []
     chart = line_chart(

@@ -75,10 +75,15 @@ def views_section(views: Sequence[HeldOutView], held_out: int, white: float) -> 
         held_out: how many were held out.
         white: reflectance in full brightness of the pictures (`white_of`).
     """
+    header = ("", "object: mean ± SD", "object: range", "whole frame: mean ± SD", "whole frame: range")
+    scores = [view.scores for view in views]
+    rows = [
+        (name, *_over_views(scores, key), *_over_views(scores, f"full_{key}")) for key, (name, _) in _METRICS.items()
+    ]
     number = f"all {held_out}" if held_out == len(views) else f"{len(views)} of the {held_out}"
     blocks: list[Block] = [
         f"The model has not seen these views. Scores are of {number} held-out views.",
-        _metrics_table([view.scores for view in views]),
+        Table("The paper's four metrics over the held-out views, and other readings of two.", header, rows),
         f"In the maps the spectral angle goes from {ANGLE_DRAWN_RAD[0]:g} (dark) to {ANGLE_DRAWN_RAD[1]:g} rad "
         f"(light), the error, root mean square over bands, from {ERROR_DRAWN[0]:g} (dark) to "
         f"{ERROR_DRAWN[1]:g} of reflectance (yellow); grey is what is not the object. All pseudo-RGB pictures have "
@@ -104,7 +109,7 @@ def views_section(views: Sequence[HeldOutView], held_out: int, white: float) -> 
         if np.isfinite(sam):
             scored = f"SAM {sam:.4f} rad, {scored}"
         blocks.append(Figure(pictures, f"{view.scores.name}: {scored}.", columns=4))
-    return Section("views", "Held-out views", blocks, judge_views([view.scores for view in views]))
+    return Section("views", "Held-out views", blocks, judge_views(scores))
 
 
 def judge_views(views: Sequence[ViewScores]) -> list[Finding]:
@@ -149,47 +154,25 @@ def crop_around(mask: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:
     return tuple(slice(max(0, ends[0] - margin), ends[-1] + margin + 1) for ends in (lines, samples))  # type: ignore[return-value]
 
 
-def _metrics_table(views: Sequence[ViewScores]) -> Table:
-    header = ("", "object: mean ± SD", "object: range", "whole frame: mean ± SD", "whole frame: range")
-    rows = [
-        (name, *_over_views(views, key), *_over_views(views, f"full_{key}")) for key, (name, _) in _METRICS.items()
-    ]
-    return Table("The paper's four metrics over the held-out views, and other readings of two.", header, rows)
-
-
 def bands_section(
     views: Sequence[ViewScores],
     wavelengths_nm: Float[np.ndarray, "bands"],
     typical_uncertainty: Float[np.ndarray, "bands"] | None,
 ) -> Section:
     """Curves by band of the object's error, PSNR and SSIM, and the histogram of the spectral angle."""
-    rmse, psnr, ssim = (
-        [
-            Curve(
-                "mean ± SD over views",
-                wavelengths_nm,
-                *sample_mean_and_sd(np.stack([getattr(view, name) for view in views])),
-            )
-        ]
-        for name in ("rmse", "psnr_db", "ssim")
-    )
     caption = (
         "Root mean square error of the object's reflectance, peak signal-to-noise ratio for a peak of 1, and "
         "structural similarity with moments over all of the object's pixels."
     )
-    if typical_uncertainty is not None:
-        rmse.append(Curve("noise of the measurement", wavelengths_nm, typical_uncertainty, dashed=True))
-        caption += " Measured pixels have noise of their own (dashed), which no rendering can repeat."
-    charts = {
-        y_label: line_chart(
-            curves, x_label="wavelength (nm)", y_label=y_label, alt=f"{y_label} by wavelength", from_zero=from_zero
-        )
-        for curves, y_label, from_zero in (
-            (rmse, "RMSE of reflectance", True),
-            (psnr, "PSNR (dB)", False),
-            (ssim, "SSIM", False),
-        )
-    }
+    charts, means = {}, {}
+    for name, y_label in (("rmse", "RMSE of reflectance"), ("psnr_db", "PSNR (dB)"), ("ssim", "SSIM")):
+        means[name], spread = sample_mean_and_sd(np.stack([getattr(view, name) for view in views]))
+        curves = [Curve("mean ± SD over views", wavelengths_nm, means[name], spread)]
+        if name == "rmse" and typical_uncertainty is not None:
+            curves.append(Curve("noise of the measurement", wavelengths_nm, typical_uncertainty, dashed=True))
+            caption += " Measured pixels have noise of their own (dashed), which no rendering can repeat."
+        alt, from_zero = f"{y_label} by wavelength", name == "rmse"
+        charts[y_label] = line_chart(curves, x_label="wavelength (nm)", y_label=y_label, alt=alt, from_zero=from_zero)
     angles = object_angles(views)
     if len(angles):
         middle, high, top = np.percentile(angles, (50.0, 95.0, _PERCENTILE_DRAWN))
@@ -207,7 +190,7 @@ def bands_section(
             f"{100.0 - _PERCENTILE_DRAWN:g} % are not drawn."
         )
     figure = Figure(charts, caption, columns=2)
-    findings = judge_bands(rmse[0].y, wavelengths_nm, typical_uncertainty)
+    findings = judge_bands(means["rmse"], wavelengths_nm, typical_uncertainty)
     return Section("bands", "Accuracy by band and pixel", [figure], findings)
 
 
