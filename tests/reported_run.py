@@ -14,7 +14,7 @@ from hsi_sc_nerf.analysis.size import Size
 from hsi_sc_nerf.analysis.traits import WHOLE, MapMean, MeanAndSd, RegionTraits, Traits
 from hsi_sc_nerf.export.cloud import write_spectral_ply
 from hsi_sc_nerf.files import write_json
-from hsi_sc_nerf.report.build import ReportSources, write_report
+from hsi_sc_nerf.report.build import write_report
 
 HOSTILE = "</script><img src=x onerror=alert(1)>\"'&{{ 7 * 7 }}"
 COMPARISON = {
@@ -61,5 +61,5 @@ def write_run(folder: Path) -> Path:
 
 def write_page(run: Path) -> Path:
     """Write the run's report; returns its path."""
-    write_report(run, run / "report.html", ReportSources(indices=("NDVI", "own = R550 / R670")))
+    write_report(run, run / "report.html", indices=("NDVI", "own = R550 / R670"))
     return run / "report.html"

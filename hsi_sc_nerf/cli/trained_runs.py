@@ -277,11 +277,9 @@ class ReportCommand:
         output = self.output or run / "report.html"
         require_writable(output.parent)
         require_dataset_of_run(run / "config.yml")
-        from hsi_sc_nerf.report.build import ReportSources, write_report
+        from hsi_sc_nerf.report.build import write_report
 
-        sources = ReportSources(
-            self.cloud, self.comparison, self.traits, self.views, self.points, self.index, self.calibration
-        )
-        write_report(run, output, sources)
+        given = (self.cloud, self.comparison, self.traits, self.views, self.points, self.index, self.calibration)
+        write_report(run, output, *given)
         size_mb = output.stat().st_size / 1e6
         Console().print(f"{escape(str(output))} ({size_mb:.1f} MB)", soft_wrap=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,62 +53,55 @@ if TYPE_CHECKING:
 _OBLIQUE_FRACTION = 0.1
 
 
-@dataclass(frozen=True)
-class ReportSources:
-    """Inputs of a report beside the run.
+def write_report(
+    folder: Path,
+    output: Path,
+    cloud: Path | None = None,
+    comparison: Path | None = None,
+    traits: Path | None = None,
+    views: int | None = None,
+    points: int = PAGE_POINTS,
+    indices: Sequence[str] = (),
+    calibrations: Sequence[Path] = (),
+) -> None:
+    """Write the report of the run in ``folder``, completely or not at all.
 
-    Attributes:
+    Args:
         cloud: PLY of the run; None: ``point_cloud.ply`` in the run's folder, or else the surface is sampled.
         comparison: ``comparison.json``; None: the one in the run's folder, if there is one.
         traits: ``traits.json``; likewise.
-        views: how many held-out views to render; None for all.
-        points: how many points of the cloud to show.
+        views: how many held-out views to render, at least 1; None for all.
+        points: how many points of the cloud to show, at least 1.
         indices: to show on it, as `find_indices` reads them; none: those that the traits were measured with.
         calibrations: tables (`read_calibration`) to show on it.
-    """
-
-    cloud: Path | None = None
-    comparison: Path | None = None
-    traits: Path | None = None
-    views: int | None = None
-    points: int = PAGE_POINTS
-    indices: Sequence[str] = ()
-    calibrations: Sequence[Path] = ()
-
-
-def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
-    """Write the report of the run in ``folder``, completely or not at all.
 
     Raises:
         InputError: the run, its dataset or a file given cannot be used, or the report cannot be written.
 
     Example:
-        >>> write_report(Path("outputs/pear/hsi-sc-nerf/run"), Path("report.html"), ReportSources(views=4))
+        >>> write_report(Path("outputs/pear/hsi-sc-nerf/run"), Path("report.html"), views=4)
     """
-    if (sources.views is not None and sources.views < 1) or sources.points < 1:
-        raise InputError("--views and --points must be at least 1.")
     # Before the slow rendering, so that unusable files are refused at once.
-    comparison_path = _given_or_beside(sources.comparison, folder / "comparison.json", "hsi-sc-nerf compare")
-    traits_path = _given_or_beside(sources.traits, folder / "traits.json", "hsi-sc-nerf traits")
-    comparison, traits = read_known(comparison_path), read_known(traits_path)
-    results = [comparison_section(comparison, comparison_path), traits_section(traits, traits_path)]
+    comparison_path = _given_or_beside(comparison, folder / "comparison.json", "hsi-sc-nerf compare")
+    traits_path = _given_or_beside(traits, folder / "traits.json", "hsi-sc-nerf traits")
+    compared, measured = read_known(comparison_path), read_known(traits_path)
+    results = [comparison_section(compared, comparison_path), traits_section(measured, traits_path)]
     with content_of(traits_path, "traits"):
-        indices = [*sources.indices] or [str(word) for word in each_object(traits or {})[0].get("indices", ())]
-    calibrations = [read_calibration(path) for path in sources.calibrations]
+        indices = [*indices] or [str(word) for word in each_object(measured or {})[0].get("indices", ())]
+    read = [read_calibration(path) for path in calibrations]
 
     from hsi_sc_nerf.models.trained_run import open_trained_run
 
     run = open_trained_run(folder / "config.yml")
-    cloud = replace(_cloud(run, folder, sources), metric=run.dataset.metric)
-    shown = object_section(cloud, sources.points, indices, calibrations)
-    views, held_out, dataset = _rendered(run, sources.views), len(run.manager.eval_dataset), run.dataset
-    scores, white = [view.scores for view in views], white_of(views)
+    shown = object_section(_cloud(run, folder, cloud, points), points, indices, read)
+    rendered, held_out, dataset = _rendered(run, views), len(run.manager.eval_dataset), run.dataset
+    scores, white = [view.scores for view in rendered], white_of(rendered)
     sections = [
         *inspection_section(dataset),
         shown,
-        views_section(views, held_out, white),
+        views_section(rendered, held_out, white),
         bands_section(scores, dataset.wavelengths_nm, dataset.typical_uncertainty),
-        spectra_section(views[len(views) // 2], dataset.wavelengths_nm, white),
+        spectra_section(rendered[len(rendered) // 2], dataset.wavelengths_nm, white),
         *results,
         training_section(read_scalars(folder), stage_ends(folder)),
         calibration_section(dataset),
@@ -118,8 +111,8 @@ def write_report(folder: Path, output: Path, sources: ReportSources) -> None:
         _settings(folder),
     ]
     key_figures = metric_key_figures(scores) | _reprojection_error(dataset)
-    if comparison is not None:
-        key_figures |= comparison_key_figure(comparison)
+    if compared is not None:
+        key_figures |= comparison_key_figure(compared)
     title = f"{dataset.object_name}: hyperspectral 3D reconstruction"
     page = html_page(title, _subtitle(dataset, output), key_figures, sections)
     with atomic_write(output) as (temporary,):
@@ -177,15 +170,15 @@ def _given_or_beside(given: Path | None, beside: Path, command: str) -> Path:
     return given or beside
 
 
-def _cloud(run: TrainedRun, folder: Path, sources: ReportSources) -> SpectralCloud:
-    path = sources.cloud or folder / "point_cloud.ply"
-    if sources.cloud is not None or path.is_file():
-        return read_spectral_ply(path)
+def _cloud(run: TrainedRun, folder: Path, given: Path | None, points: int) -> SpectralCloud:
+    path = given or folder / "point_cloud.ply"
+    if given is not None or path.is_file():  # a copy by another program does not say that it has no scale
+        return replace(read_spectral_ply(path), metric=run.dataset.metric)
     from hsi_sc_nerf.export.options import CloudOptions
     from hsi_sc_nerf.export.spectral_export import export_cloud
 
     with tempfile.TemporaryDirectory() as temporary:
-        return read_spectral_ply(export_cloud(run, Path(temporary), CloudOptions(num_points=sources.points)))
+        return read_spectral_ply(export_cloud(run, Path(temporary), CloudOptions(num_points=points)))
 
 
 def _rendered(run: TrainedRun, count: int | None) -> list[HeldOutView]:

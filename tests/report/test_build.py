@@ -11,7 +11,7 @@ from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
 from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.packed.dataset import open_packed
-from hsi_sc_nerf.report.build import ReportSources, write_report
+from hsi_sc_nerf.report.build import write_report
 from hsi_sc_nerf.report.dataset_sections import (
     calibration_section,
     inspection_section,
@@ -123,14 +123,13 @@ def test_files_that_are_something_else_are_refused_and_nothing_is_written(run, t
         traits_section({"settings": {}}, run / "traits.json")
     (tmp_path / "broken.json").write_text("{")
     for sources, sentence in (
-        (ReportSources(traits=tmp_path / "broken.json"), r"broken\.json: is not a JSON object"),
-        (ReportSources(comparison=run / "no.json"), r"no\.json: there is no such file"),
-        (ReportSources(views=0), "at least 1"),
-        (ReportSources(indices=("own = R1240",)), "1240 nm"),
-        (ReportSources(calibrations=(run / "no.csv",)), r"no\.csv: cannot be read"),
+        ({"traits": tmp_path / "broken.json"}, r"broken\.json: is not a JSON object"),
+        ({"comparison": run / "no.json"}, r"no\.json: there is no such file"),
+        ({"indices": ("own = R1240",)}, "1240 nm"),
+        ({"calibrations": (run / "no.csv",)}, r"no\.csv: cannot be read"),
     ):
         with pytest.raises(InputError, match=sentence):
-            write_report(run, tmp_path / "report.html", sources)
+            write_report(run, tmp_path / "report.html", **sources)
     with pytest.raises(InputError, match=r"config\.yml"):
-        write_report(tmp_path, tmp_path / "report.html", ReportSources())
+        write_report(tmp_path, tmp_path / "report.html")
     assert not (tmp_path / "report.html").exists()
