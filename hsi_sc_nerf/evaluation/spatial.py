@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.geometry.mesh import ray_scene
@@ -46,13 +45,6 @@ def precision_recall_f_score(
         for here, there in ((reconstructed_m, reference_m), (reference_m, reconstructed_m))
     )
     return score_at(to_reference_m, to_reconstruction_m, threshold_m)
-
-
-def f_score(precision: ArrayLike, recall: ArrayLike) -> Float[np.ndarray, "*n"]:
-    """Harmonic mean of precision and recall; 0 where both are."""
-    precision, recall = np.asarray(precision, float), np.asarray(recall, float)
-    total = precision + recall
-    return np.divide(2 * precision * recall, total, out=np.zeros_like(total), where=total > 0)
 
 
 def sample_surface(
@@ -112,13 +104,15 @@ def threshold_curves(
     """Precision and recall: the fractions of distances within each threshold, the threshold itself included.
 
     The distances are those of the cloud's points to the reference, for the precision, and back, for the recall; each
-    holds one at least.
+    holds one at least. The F-score is their harmonic mean, 0 where both are 0.
     """
     precision, recall = (
         100.0 * np.searchsorted(np.sort(distances), thresholds_m, side="right") / len(distances)
         for distances in (to_reference_m, to_cloud_m)
     )
-    return ThresholdCurves(np.asarray(thresholds_m, float), precision, recall, f_score(precision, recall))
+    total = precision + recall
+    f_score = np.divide(2 * precision * recall, total, out=np.zeros_like(total), where=total > 0)
+    return ThresholdCurves(np.asarray(thresholds_m, float), precision, recall, f_score)
 
 
 def score_at(

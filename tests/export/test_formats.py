@@ -47,38 +47,6 @@ def test_las_refuses_more_bands_than_it_holds(tmp_path: Path) -> None:
         require_format(tmp_path / "cloud", "las", 167, 167 + 6)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("file_format", "name"), [("netcdf", "cloud.nc"), ("zarr", "cloud.zarr")])
-def test_xarray_opens_tables_with_wavelength_as_a_coordinate(tmp_path: Path, file_format, name: str) -> None:
-    xarray = pytest.importorskip("xarray")
-    pytest.importorskip({"netcdf": "h5netcdf", "zarr": "zarr"}[file_format])
-    written = random_cloud(COUNT)
-    for _ in range(2):  # the second replaces the first
-        path = write_cloud(tmp_path / "cloud", replace(stream(written, 7), run="pear/hsi-sc-nerf/now"), file_format)
-    assert [file.name for file in tmp_path.iterdir()] == [name]
-    options = {"engine": "h5netcdf"} if file_format == "netcdf" else {"engine": "zarr", "consolidated": False}
-    with xarray.open_dataset(path, **options) as table:
-        assert dict(table.sizes) == {"point": COUNT, "wavelength": 4}
-        np.testing.assert_array_equal(table.wavelength, WAVELENGTHS_NM)
-        assert table.wavelength.attrs["units"] == "nm"
-        assert table.attrs["Conventions"].startswith("CF-")
-        assert table.attrs["run"] == "pear/hsi-sc-nerf/now"
-        assert table.attrs["comment"].startswith("object frame")
-        attributes = {name: variable.attrs for name, variable in table.variables.items()}
-        units = {name: (found["units"], found["long_name"] != "") for name, found in attributes.items()}
-        assert units == dict.fromkeys(table.variables, ("1", True)) | {
-            "wavelength": ("nm", True),
-            **dict.fromkeys("xyz", ("m", True)),
-        }
-        assert {"x", "y", "z", "wavelength"} <= set(table.coords)
-        nearest = table.reflectance.sel(wavelength=640.0, method="nearest")
-        np.testing.assert_array_equal(nearest, written.spectra[:, 2])
-        np.testing.assert_array_equal(np.stack([table[axis] for axis in "xyz"], 1), written.points)
-        np.testing.assert_array_equal(np.stack([table[f"n{axis}"] for axis in "xyz"], 1), written.normals)
-        np.testing.assert_array_equal(table.green, written.colours[:, 1])
-        np.testing.assert_array_equal(table.opacity, written.extra["opacity"])
-
-
 @pytest.mark.parametrize(("file_format", "package"), [("las", "laspy"), ("netcdf", "h5netcdf"), ("zarr", "zarr")])
 def test_a_missing_package_is_one_sentence(tmp_path: Path, monkeypatch, file_format, package: str) -> None:
     monkeypatch.setitem(sys.modules, package, None)

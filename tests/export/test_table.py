@@ -21,24 +21,37 @@ def full_cloud():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("metric", [True, False])
-def test_a_table_in_memory_is_that_of_the_exported_file_and_comes_back_from_its_own(tmp_path, metric):
-    pytest.importorskip("h5netcdf")
+@pytest.mark.parametrize(("file_format", "engine"), [("netcdf", "h5netcdf"), ("zarr", "zarr")])
+def test_a_table_in_memory_is_that_of_the_exported_file_and_comes_back_from_its_own(
+    tmp_path, file_format, engine, metric
+):
+    pytest.importorskip(engine)
     cloud = replace(full_cloud(), metric=metric)
     table = to_xarray(cloud, "pear/hsi-sc-nerf/now")
-    exported = write_cloud(tmp_path / "cloud", replace(stream(cloud, 7), run="pear/hsi-sc-nerf/now"), "netcdf")
+    for _ in range(2):  # the second replaces the first
+        exported = write_cloud(tmp_path / "cloud", replace(stream(cloud, 7), run="pear/hsi-sc-nerf/now"), file_format)
+    assert list(tmp_path.iterdir()) == [exported]
     table.to_netcdf(tmp_path / "own.nc", engine="h5netcdf")
-    for path in (exported, tmp_path / "own.nc"):
-        with xarray.open_dataset(path, engine="h5netcdf") as read:
+    options = {"backend_kwargs": {"consolidated": False}} if engine == "zarr" else {}
+    for path, opened in ((exported, {"engine": engine} | options), (tmp_path / "own.nc", {"engine": "h5netcdf"})):
+        with xarray.open_dataset(path, **opened) as read:
             xarray.testing.assert_identical(read.load(), table)
             assert_equal(from_xarray(read), cloud)
-            assert {read[name].units for name in "xyz"} == {"m" if metric else "1"}
 
 
-def test_names_and_units_are_those_of_cf():
-    table = to_xarray(full_cloud())
+@pytest.mark.parametrize("metric", [True, False])
+def test_names_units_and_attributes_are_those_of_cf(metric):
+    cloud = replace(full_cloud(), metric=metric)
+    table = to_xarray(cloud, "pear/hsi-sc-nerf/now")
+    assert table.attrs["Conventions"].startswith("CF-")
+    assert table.attrs["run"] == "pear/hsi-sc-nerf/now"
+    assert table.attrs["comment"].startswith("object frame")
+    assert ("scale" in table.attrs) != metric
+    assert all(table[name].long_name for name in table.variables)
     assert set(table.coords) == {"wavelength", "x", "y", "z"}
     assert (table.wavelength.units, table.wavelength.standard_name) == ("nm", "radiation_wavelength")
-    assert {table[name].units for name in "xyz"} == {"m"}
+    np.testing.assert_array_equal(table.reflectance.sel(wavelength=640.0, method="nearest"), cloud.spectra[:, 2])
+    assert {table[name].units for name in "xyz"} == {"m" if metric else "1"}
     assert {table[name].units for name in ("reflectance", "material", "irradiance", "spectral_std")} == {"1"}
     assert table.reflectance.ancillary_variables == "spectral_std"
     assert table.irradiance.ancillary_variables == "irradiance_std"
