@@ -45,8 +45,6 @@ _LAS_TEXT_RECORD = 3
 """The specification's record for a text that describes the file."""
 _LAS_NORMALS = ("NormalX", "NormalY", "NormalZ")  # CloudCompare takes these for normals
 _EIGHT_TO_SIXTEEN_BITS = 257
-_PLACES = {"coordinates": "x y z"}
-"""Attribute of variables with a wavelength."""
 
 
 def write_cloud(path_without_suffix: Path, cloud: CloudStream, file_format: CloudFormat) -> Path:
@@ -148,7 +146,7 @@ def _write_las(path: Path, cloud: CloudStream) -> None:
 def _variables(cloud: CloudStream) -> Iterator[tuple[str, str, tuple[str, ...], dict[str, str]]]:
     """Name, type, dimensions and attributes of each variable as they stand in a file."""
     for name, dtype, dimensions, attributes in table_variables(cloud):
-        yield name, dtype, dimensions, attributes | (_PLACES if "wavelength" in dimensions else {})
+        yield name, dtype, dimensions, attributes | ({"coordinates": "x y z"} if "wavelength" in dimensions else {})
 
 
 def _fill(variables: Mapping[str, Any], cloud: CloudStream) -> None:

@@ -90,7 +90,13 @@ def sample_points(
     poses[:, :3, 3] = run.to_scene(poses[:, :3, 3])
     max_distance = max_distance_m * run.scale
     points = run.to_scene(points_m)
-    outward = outward_normals(normals, points, lambda p: _density(run.model, p), max_distance)
+
+    @torch.no_grad()
+    def density(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 1"]:
+        parts = torch.from_numpy(positions).float().to(run.model.device)[:, None].split(BATCH_POINTS)
+        return torch.cat([run.model.field.density_fn(part)[:, 0] for part in parts]).cpu().numpy()
+
+    outward = outward_normals(normals, points, density, max_distance)
     count, bands = len(points), len(run.model.wavelengths_nm)
     result = PointSpectra(outward, np.empty((count, bands), np.float32), *np.zeros((2, count), np.float32))
     with progress_bar("sampling", "points", count) as update:
@@ -210,12 +216,6 @@ def _render_rays(
     ray_cosines = torch.from_numpy(cosines[:, None]).to(rays.origins)
     depth, _ = surface_depth(model, rays.origins, rays.directions, outputs["depth"], ray_cosines)
     return spectra.cpu().numpy(), outputs["accumulation"][:, 0].cpu().numpy(), depth[:, 0].cpu().numpy()
-
-
-@torch.no_grad()
-def _density(model: SpectralModel, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 1"]:
-    parts = torch.from_numpy(points).float().to(model.device)[:, None].split(BATCH_POINTS)
-    return torch.cat([model.field.density_fn(part)[:, 0] for part in parts]).cpu().numpy()
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ most from the front gives its spectrum: seen from the front, as the white refere
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -36,9 +36,9 @@ OPAQUE_WITHIN, _STEP = 0.1, 0.004
 _PILOT_POINTS = (1_000, 20_000)
 _MARGIN = 1.02
 """Factor on the number of candidates, so that one more batch is rarely needed."""
-_MAX_BATCH = 2_000_000
+MAX_BATCH = 2_000_000
 """Candidates at a time, which take 200 bytes each."""
-_MAX_CANDIDATES = 50
+MAX_CANDIDATES = 50
 """Candidates in all, as a multiple of the points to find, or of the largest batch where that is more."""
 MIN_VOXEL = 1 / 160
 """Smallest voxel, as a fraction of the box's longest side: half a millimetre on a turntable. Voxels are not smaller
@@ -70,18 +70,14 @@ class SurfacePoints:
     def __len__(self) -> int:
         return len(self.points)
 
-    def columns(self) -> list[np.ndarray]:
-        """The attributes, in their order."""
-        return [getattr(self, field.name) for field in fields(self)]
-
     def select(self, rows: np.ndarray | slice) -> SurfacePoints:
         """The points that a slice, an index or a boolean array selects."""
-        return SurfacePoints(*(column[rows] for column in self.columns()))
+        return SurfacePoints(*(column[rows] for column in vars(self).values()))
 
     @staticmethod
     def concatenate(parts: list[SurfacePoints]) -> SurfacePoints:
         """The points of all parts, in their order."""
-        return SurfacePoints(*map(np.concatenate, zip(*(part.columns() for part in parts), strict=True)))
+        return SurfacePoints(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
 def sample_surface_points(
@@ -139,8 +135,6 @@ def even_points(
     triangles: Int[np.ndarray, "t 3"],
     count: int,
     keep: Callable[[Float[np.ndarray, "n 3"]], SurfacePoints],
-    max_batch: int = _MAX_BATCH,
-    max_candidates: int = _MAX_CANDIDATES,
 ) -> SurfacePoints:
     """``count`` points spread evenly over a mesh's area, after ``keep`` has rejected some candidates.
 
@@ -151,18 +145,16 @@ def even_points(
         triangles: triangles of the mesh.
         count: points to return; there are fewer if hardly any candidate is kept.
         keep: turns candidates on the mesh into as many or fewer points.
-        max_batch: candidates at a time.
-        max_candidates: in all, as a multiple of ``count``, or of ``max_batch`` where that is more.
     """
     rng = np.random.default_rng(0)
     parts: list[SurfacePoints] = []
     found = tried = 0
     batch = int(np.clip(count, *_PILOT_POINTS))
-    while found < count and tried < (max_candidates * max(count, max_batch) if found else max_batch):
+    while found < count and tried < (MAX_CANDIDATES * max(count, MAX_BATCH) if found else MAX_BATCH):
         parts.append(keep(sample_surface(vertices, triangles, batch, seed=int(rng.integers(2**31)))))
         found, tried = found + len(parts[-1]), tried + batch
         needed = (count - found) * tried / found * _MARGIN + 1 if found else 10 * tried
-        batch = min(int(needed), max_batch)
+        batch = min(int(needed), MAX_BATCH)
     return SurfacePoints.concatenate(parts).select(np.sort(rng.permutation(found)[:count]))
 
 

@@ -1,7 +1,5 @@
 """The surface of a ball that a model knows exactly: found, spread over evenly, seen by the right frames."""
 
-from functools import partial
-
 import cv2
 import numpy as np
 import pytest
@@ -154,8 +152,8 @@ def test_a_small_region_is_searched_only_near_it(run, tmp_path, tried):
 
 
 def test_a_region_with_hardly_any_surface_gives_what_it_has(run, tmp_path, tried, monkeypatch, capsys):
-    searched = partial(sampling.even_points, max_batch=2000, max_candidates=1)
-    monkeypatch.setattr(sampling, "even_points", searched)
+    monkeypatch.setattr(sampling, "MAX_BATCH", 2000)
+    monkeypatch.setattr(sampling, "MAX_CANDIDATES", 1)
     box = (0.05, -0.0215, 0.0585, 0.07, -0.0185, 0.0615)
     options = CloudOptions(num_points=2000, roi_box=box, remove_outliers=False)
     count = len(read_spectral_ply(export_cloud(run, tmp_path, options)))

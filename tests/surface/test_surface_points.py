@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, look_at, pixel_rays, turntable_camera_to_world
+from hsi_sc_nerf.surface import surface_points
 from hsi_sc_nerf.surface.depth_renders import DepthRenders
 from hsi_sc_nerf.surface.regions import EVERYWHERE, box_region
 from hsi_sc_nerf.surface.surface_points import SurfaceMesh, SurfacePoints, even_points, surface_mesh
@@ -46,26 +47,28 @@ def test_as_many_points_as_asked_for_evenly_over_what_is_kept() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [0.2, 2e-3])
-def test_a_narrow_region_is_searched_in_pieces(width: float) -> None:
+def test_a_narrow_region_is_searched_in_pieces(width: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """A 250th of the area is kept, or so little of it that the first sample misses it."""
     tried = []
+    monkeypatch.setattr(surface_points, "MAX_BATCH", 200_000)
 
     def keep(points: np.ndarray) -> SurfacePoints:
         tried.append(len(points))
         return at(points[(points[:, 1] > 1.0) & (points[:, 1] < 1.2) & (np.abs(points[:, 0] - 3.0) < width / 2)])
 
-    found, again = (even_points(VERTICES, TRIANGLES, 50, keep, max_batch=200_000).points for _ in "ab")
+    found, again = (even_points(VERTICES, TRIANGLES, 50, keep).points for _ in "ab")
     assert len(found) == 50
     np.testing.assert_array_equal(found, again)
     assert np.std(found[:, 1]) == pytest.approx(0.2 / np.sqrt(12), rel=0.25)
     assert max(tried) <= 200_000
 
 
-def test_the_search_ends_with_what_was_found() -> None:
-    limits = {"max_batch": 10_000, "max_candidates": 3}
-    found = even_points(VERTICES, TRIANGLES, 5000, lambda p: at(p[p[:, 0] < 0.5]), **limits)
+def test_the_search_ends_with_what_was_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(surface_points, "MAX_BATCH", 10_000)
+    monkeypatch.setattr(surface_points, "MAX_CANDIDATES", 3)
+    found = even_points(VERTICES, TRIANGLES, 5000, lambda p: at(p[p[:, 0] < 0.5]))
     assert len(found) == pytest.approx(35_000 / 20, rel=0.1)  # the first sample and three batches
-    assert len(even_points(VERTICES, TRIANGLES, 100, lambda p: at(p[:0]), **limits)) == 0
+    assert len(even_points(VERTICES, TRIANGLES, 100, lambda p: at(p[:0]))) == 0
 
 
 def test_triangles_in_a_box_are_those_that_may_reach_it() -> None:
