@@ -69,7 +69,6 @@ def comparison_tables(figures: Mapping[str, Any]) -> tuple[TextTable, TextTable]
 def comparison_summary(comparison: Comparison) -> dict[str, Any]:
     """All figures in metres and percent, for JSON."""
     forth, back = comparison.to_reference_m, comparison.to_cloud_m
-    curves = {key: values.tolist() for key, values in asdict(comparison.curves).items()}
     return {
         "scores": {
             name: {"threshold_m": threshold_m, **asdict(score_at(forth, back, threshold_m))}
@@ -86,7 +85,7 @@ def comparison_summary(comparison: Comparison) -> dict[str, Any]:
         "alignment": _alignment(comparison),
         "seen_fraction_of_reference": comparison.seen_fraction,
         "settings": asdict(comparison.config),
-        "curves": curves,
+        "curves": {key: values.tolist() for key, values in asdict(comparison.curves).items()},
         "version": __version__,
     }
 
@@ -129,20 +128,14 @@ def write_comparison(folder: Path, comparison: Comparison, cloud_name: str, refe
             ("reference", comparison.reference.points_m, comparison.to_cloud_m),
         ]
         _draw_distances(pictures, surfaces, limit_m)
-        _write_distance_ply(cloud, comparison.cloud.points_m, comparison.to_reference_m, limit_m)
+        distances_m = comparison.to_reference_m  # also as a column that is a scalar field in CloudCompare
+        colours = colormaps[INDEX_COLOURS](np.clip(distances_m / limit_m, 0, 1), bytes=True)[:, :3]
+        columns = dict(zip("xyz", comparison.cloud.points_m.T, strict=True))
+        columns |= dict(zip(("red", "green", "blue"), colours.T, strict=True))
+        columns["scalar_distance_m"] = distances_m.astype(np.float32)
+        PlyData([ply_vertices(columns)], byte_order="<").write(str(cloud))
         page.write_text(_page(comparison, figures, cloud_name, reference_name, limit_m), encoding="utf-8")
     return figures
-
-
-def _write_distance_ply(
-    path: Path, points_m: Float[np.ndarray, "n 3"], distances_m: Float[np.ndarray, "n"], limit_m: float
-) -> None:
-    """Points with their distance as colour and as ``scalar_distance_m``, a scalar field in CloudCompare."""
-    colours = colormaps[INDEX_COLOURS](np.clip(distances_m / limit_m, 0, 1), bytes=True)[:, :3]
-    columns = dict(zip("xyz", points_m.T, strict=True))
-    columns |= dict(zip(("red", "green", "blue"), colours.T, strict=True))
-    columns["scalar_distance_m"] = distances_m.astype(np.float32)
-    PlyData([ply_vertices(columns)], byte_order="<").write(str(path))
 
 
 def _page(

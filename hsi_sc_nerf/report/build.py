@@ -26,7 +26,7 @@ from hsi_sc_nerf.report.dataset_sections import (
     masks_section,
     poses_section,
 )
-from hsi_sc_nerf.report.held_out_views import HeldOutView, render_held_out
+from hsi_sc_nerf.report.held_out_views import render_held_out
 from hsi_sc_nerf.report.page import Block, CloudViewer, Section, Table, html_page, read_known
 from hsi_sc_nerf.report.run_sections import (
     comparison_key_figure,
@@ -45,7 +45,6 @@ from hsi_sc_nerf.report.view_sections import (
     views_section,
     white_of,
 )
-from hsi_sc_nerf.terminal import progress_bar
 
 if TYPE_CHECKING:
     from hsi_sc_nerf.models.trained_run import TrainedRun
@@ -94,7 +93,7 @@ def write_report(
 
     run = open_trained_run(folder / "config.yml")
     shown = object_section(_cloud(run, folder, cloud, points), points, indices, read)
-    rendered, held_out, dataset = _rendered(run, views), len(run.manager.eval_dataset), run.dataset
+    rendered, held_out, dataset = [*render_held_out(run, views)], len(run.manager.eval_dataset), run.dataset
     scores, white = [view.scores for view in rendered], white_of(rendered)
     sections = [
         *inspection_section(dataset),
@@ -179,18 +178,6 @@ def _cloud(run: TrainedRun, folder: Path, given: Path | None, points: int) -> Sp
 
     with tempfile.TemporaryDirectory() as temporary:
         return read_spectral_ply(export_cloud(run, Path(temporary), CloudOptions(num_points=points)))
-
-
-def _rendered(run: TrainedRun, count: int | None) -> list[HeldOutView]:
-    """``count`` held-out views (all without it), with a progress bar."""
-    held_out = len(run.manager.eval_dataset)
-    count = min(held_out, count or held_out)
-    views: list[HeldOutView] = []
-    with progress_bar("rendering", "held-out views", count) as done:
-        for view in render_held_out(run, count):
-            views.append(view)
-            done(len(views))
-    return views
 
 
 def _subtitle(dataset: PackedDataset, output: Path) -> str:

@@ -23,6 +23,7 @@ from hsi_sc_nerf.evaluation.spectral_metrics import (
     squared_error_map,
 )
 from hsi_sc_nerf.packed.pixels import spread_over
+from hsi_sc_nerf.terminal import progress_bar
 
 if TYPE_CHECKING:
     from hsi_sc_nerf.models.trained_run import TrainedRun
@@ -49,10 +50,14 @@ class HeldOutView:
     points: list[PixelSpectra]
 
 
-def render_held_out(run: TrainedRun, views: int) -> Iterator[HeldOutView]:
-    """Render ``views`` of the held-out views, evenly spread; the cubes of one are in memory at a time."""
-    for index in spread_of_views(len(run.manager.eval_dataset.frames), views):
-        yield _held_out_view(run, index)
+def render_held_out(run: TrainedRun, views: int | None) -> Iterator[HeldOutView]:
+    """Render ``views`` of the held-out views (None: all), evenly spread; the cubes of one are in memory at a time."""
+    held_out = len(run.manager.eval_dataset.frames)
+    chosen = spread_of_views(held_out, views or held_out)
+    with progress_bar("rendering", "held-out views", len(chosen)) as done:
+        for number, index in enumerate(chosen):
+            yield _held_out_view(run, index)
+            done(number + 1)
 
 
 def _held_out_view(run: TrainedRun, index: int) -> HeldOutView:

@@ -30,7 +30,6 @@ _PSNR = {
     "Eval Images Metrics Dict (all images)/psnr": "all held-out views",
     "Eval Images Metrics/psnr": "one held-out view",
 }
-_NO_SETTINGS = ("_target",)
 Scalars = dict[str, tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]]
 """Steps and values by TensorBoard's tag."""
 _CHECKPOINT = re.compile(r"step-(\d+)\.ckpt")
@@ -110,7 +109,7 @@ def _curves(scalars: Scalars, tags: Mapping[str, str]) -> list[Curve]:
 def flat_settings(config: Any, prefix: str = "") -> dict[str, str]:
     """Settings of nested dataclasses and mappings as text, by their dotted names; of whole paths the last name."""
     if is_dataclass(config) and not isinstance(config, type):
-        parts = {f.name: getattr(config, f.name) for f in fields(config) if f.name not in _NO_SETTINGS}
+        parts = {f.name: getattr(config, f.name) for f in fields(config) if f.name != "_target"}
     elif isinstance(config, Mapping) and config:
         parts = {str(key): value for key, value in config.items()}
     elif isinstance(config, Path) and config.is_absolute():
