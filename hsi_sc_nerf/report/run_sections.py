@@ -81,7 +81,7 @@ def training_section(scalars: Scalars, stage_ends: Mapping[str, int]) -> Section
     )
     steps, psnr_db = scalars.get("Train Metrics Dict/psnr", (np.zeros(0), np.zeros(0)))
     last_stage_from = ([0.0, 0.0, *marks.values()])[-2] if marks else 0.0
-    findings = judge_training(psnr_db[steps >= last_stage_from])
+    findings = judge_training(psnr_db[(steps >= last_stage_from) & np.isfinite(psnr_db)])
     return Section("training", "Training", [Figure(charts, caption, columns=2)], findings)
 
 
@@ -101,7 +101,7 @@ def judge_training(psnr_db: Float[np.ndarray, "n"]) -> list[Finding]:
 def _curves(scalars: Scalars, tags: Mapping[str, str]) -> list[Curve]:
     """Curves of the logged tags, without those that are tiny beside the largest."""
     found = {name: scalars[tag] for tag, name in tags.items() if tag in scalars}
-    heights = {name: np.nanmax(np.abs(values), initial=0.0) for name, (_, values) in found.items()}
+    heights = {name: np.abs(values[np.isfinite(values)]).max(initial=0.0) for name, (_, values) in found.items()}
     least = _SMALLEST_FRACTION * max(heights.values(), default=0.0)
     return [Curve(name, *shortened(*curve)) for name, curve in found.items() if heights[name] > least]
 

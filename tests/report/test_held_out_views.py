@@ -21,7 +21,14 @@ from hsi_sc_nerf.report.held_out_views import (
     sample_mean_and_sd,
     score_view,
 )
-from hsi_sc_nerf.report.run_sections import flat_settings, read_scalars, settings_section, shortened, stage_ends
+from hsi_sc_nerf.report.run_sections import (
+    flat_settings,
+    read_scalars,
+    settings_section,
+    shortened,
+    stage_ends,
+    training_section,
+)
 
 
 def test_a_view_that_is_off_by_a_constant(device):
@@ -103,6 +110,15 @@ def test_curves_of_a_resumed_run_have_one_value_a_step(tmp_path):
     steps, values = read_scalars(tmp_path)["Train Loss"]
     np.testing.assert_array_equal(steps, np.arange(8))
     np.testing.assert_allclose(values, 1.0 / (steps + 1), rtol=1e-6)
+
+
+def test_steps_that_were_not_finite_leave_the_others_in_the_charts_and_the_finding():
+    steps, values = np.arange(40.0), np.full(40, 30.0)
+    values[38] = np.inf
+    tags = ("Train Loss", "Train Loss Dict/hsi_loss", "Train Metrics Dict/psnr")
+    section = training_section({tag: (steps, values if "hsi" not in tag else np.ones(40)) for tag in tags}, {})
+    assert [*section.blocks[0].pictures] == ["Loss of training batches", "Peak signal-to-noise ratio"]
+    assert [finding.level for finding in section.findings] == ["green"]
 
 
 def test_long_curves_are_shortened_to_means():
