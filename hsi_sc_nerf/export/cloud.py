@@ -60,7 +60,8 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "gloss": ("1", "what the skin mirrors, as reflectance, mean over bands"),
 }
 """CF unit and meaning of each column that this package writes, the bands' apart."""
-_UNSCALED = dict.fromkeys("xyz", ("1", "position in the object frame, in distances of the camera from the axis"))
+UNSCALED = dict.fromkeys("xyz", ("1", "position in the object frame, in distances of the camera from the axis"))
+"""Those of columns that have others where nothing gave the scale."""
 _GEOMETRY = (*"xyz", *NORMALS)
 _MEASURED = {*COLUMNS} - {*_GEOMETRY, *COLOURS}
 _BAND_NAME = re.compile(r"scalar_(\d+(?:\.\d+)?)nm")
@@ -184,11 +185,6 @@ def cloud_attributes(run: str = "", metric: bool = True) -> dict[str, str]:
     return attributes | ({"run": run} if run else {}) | ({} if metric else {"scale": NO_SCALE})
 
 
-def column_meanings(metric: bool) -> dict[str, tuple[str, str]]:
-    """`COLUMNS`, with the unit that positions have where they are not ``metric``."""
-    return COLUMNS if metric else COLUMNS | _UNSCALED
-
-
 def comment_lines(columns: Iterable[str], run: str = "", metric: bool = True) -> list[str]:
     """Attributes and the meaning of the columns as lines of text, in ASCII: ``x y z [m]: position ...``.
 
@@ -203,7 +199,7 @@ def comment_lines(columns: Iterable[str], run: str = "", metric: bool = True) ->
     """
     lines = [f"{name}: {value}" for name, value in cloud_attributes(run, metric).items()]
     lines.append("bands [{}]: {}, one column a band, named by its centre in nm".format(*REFLECTANCE))
-    columns, meanings = tuple(columns), column_meanings(metric)
+    columns, meanings = tuple(columns), COLUMNS | ({} if metric else UNSCALED)
     if any(name.startswith("material_") for name in columns):
         lines.append("material_ [{}]: {}".format(*MATERIAL))
     alike: dict[tuple[str, str], list[str]] = {}

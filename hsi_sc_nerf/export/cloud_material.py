@@ -26,7 +26,7 @@ from hsi_sc_nerf.export.cloud import (
 )
 from hsi_sc_nerf.light.fit import WHITE_STD
 from hsi_sc_nerf.light.of_run import RunLight
-from hsi_sc_nerf.spectra import SAME_BAND_NM, same_bands
+from hsi_sc_nerf.spectra import same_bands
 
 NEIGHBOURS = 4
 """Points of the cloud whose mean a point gets."""
@@ -125,8 +125,8 @@ def read_material(path: Path, wavelengths_nm: Float[np.ndarray, "bands"]) -> Clo
         >>> spectra, relative_std = material.at(points_m)
     """
     cloud = read_spectral_ply(path)
-    same = len(cloud.wavelengths_nm) == len(wavelengths_nm)
-    if not same or not np.allclose(cloud.wavelengths_nm, wavelengths_nm, atol=SAME_BAND_NM):
+    bands = same_bands(wavelengths_nm, cloud.wavelengths_nm)
+    if bands is None or bands.tolist() != [*range(len(wavelengths_nm))]:
         raise InputError(f"{path}: its bands are not those of the run; take the cloud of the same run.")
     spectra = material_spectra(cloud)
     if spectra is None or not set(LIGHT_COLUMNS) <= set(cloud.extra):

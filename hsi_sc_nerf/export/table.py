@@ -18,14 +18,15 @@ from jaxtyping import Shaped
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import (
     COLOURS,
+    COLUMNS,
     MATERIAL,
     NORMALS,
     REFLECTANCE,
+    UNSCALED,
     CloudStream,
     SpectralCloud,
     band_property_names,
     cloud_attributes,
-    column_meanings,
     material_names,
     stream,
 )
@@ -101,7 +102,8 @@ def from_xarray(table: xarray.Dataset) -> SpectralCloud:
 def table_variables(cloud: CloudStream) -> Iterator[tuple[str, str, tuple[str, ...], dict[str, str]]]:
     """Name, type, dimensions and attributes of each variable; the positions of points are coordinates."""
     extra_names = cloud.extra_names
-    meanings = {"reflectance": REFLECTANCE, "material": MATERIAL} | column_meanings(cloud.metric)
+    meanings = {"reflectance": REFLECTANCE, "material": MATERIAL} | COLUMNS
+    meanings |= {} if cloud.metric else UNSCALED
     of_material = material_names(cloud.wavelengths_nm, extra_names)
     spectral = ("reflectance", "material") if of_material else ("reflectance",)
     others = (name for name in extra_names if name not in of_material)

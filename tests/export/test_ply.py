@@ -55,11 +55,6 @@ def test_comments_state_frame_run_and_the_unit_of_every_column(tmp_path: Path) -
     for name in ("x", "nz", "blue", "opacity", "views", "bands"):
         assert " [m]: " in described[name] if name == "x" else " [1]: " in described[name]
     assert_equal(read_spectral_ply(path), random_cloud())
-    assert read_spectral_ply(path).metric
-
-
-def test_a_cloud_without_a_scale_states_no_metres(tmp_path: Path) -> None:
-    path = tmp_path / "cloud.ply"
     write_spectral_ply(path, random_cloud(metric=False))
     comments = PlyData.read(str(path)).comments
     assert any(line.startswith("scale: unknown; lengths are in distances of the camera") for line in comments)

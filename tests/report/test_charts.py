@@ -55,6 +55,8 @@ def test_what_is_not_measured_is_a_gap_in_line_and_band():
     svg = line_chart([Curve("a", np.arange(5.0), y, np.full(5, 0.1))], **LABELS)
     (line,) = paths(svg, "line")
     assert line.count("M") == 2
+    alone = line_chart([Curve("", np.arange(4.0), np.array([1.0, np.nan, 2.0, np.nan]))], **LABELS)
+    assert [len(numbers(path)) for path in paths(alone, "line")[1:]] == [2, 2]  # dots
     assert len(numbers(line)) == 4
     assert sum(band.count("M") for band in paths(svg, "band")) == 2
     assert ">a</" in svg
@@ -70,11 +72,6 @@ def test_a_single_band_is_a_dot_with_a_bar_of_its_spread(spread):
         bar = numbers(paths(svg, "band")[-1])
         assert bar[:, 0].tolist() == dot[:, 0].tolist()
         assert bar[:, 1].max() > dot[0, 1] > bar[:, 1].min()
-
-
-def test_a_value_between_gaps_is_a_dot():
-    svg = line_chart([Curve("", np.arange(4.0), np.array([1.0, np.nan, 2.0, np.nan]))], **LABELS)
-    assert [len(numbers(path)) for path in paths(svg, "line")[1:]] == [2, 2]
 
 
 def test_a_band_lies_around_its_line():
