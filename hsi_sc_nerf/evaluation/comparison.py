@@ -239,11 +239,8 @@ def _check_sizes(
     ratio = robust_radius(reference.surface.points_m) / max(robust_radius(cloud.points_m), 1e-12)
     # An alignment by features with a scale takes any size.
     if not (config.with_scale and alignment == "features") and not 1 / LARGEST_RATIO < ratio < LARGEST_RATIO:
-        larger, smaller, times = (
-            (reference.name, cloud_name, ratio)
-            if ratio > 1.0
-            else (cloud_name, reference.name, 1.0 / max(ratio, 1e-12))
-        )
+        larger, smaller = (reference.name, cloud_name) if ratio > 1.0 else (cloud_name, reference.name)
+        times = max(ratio, 1.0 / max(ratio, 1e-12))
         raise InputError(
             f"{larger}: is {times:.3g} times as large as {smaller}; the cloud has to be in metres, the reference in "
             f"{config.reference_unit} (--reference-unit), or align with a scale (--align features --with-scale)."

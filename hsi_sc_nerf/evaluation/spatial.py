@@ -40,11 +40,8 @@ def precision_recall_f_score(
     """
     if not len(reconstructed_m) or not len(reference_m):
         return SpatialScore(0.0, 0.0, 0.0)
-    to_reference_m, to_reconstruction_m = (
-        Surface(there).distances_m(here)
-        for here, there in ((reconstructed_m, reference_m), (reference_m, reconstructed_m))
-    )
-    return score_at(to_reference_m, to_reconstruction_m, threshold_m)
+    to_reference_m = Surface(reference_m).distances_m(reconstructed_m)
+    return score_at(to_reference_m, Surface(reconstructed_m).distances_m(reference_m), threshold_m)
 
 
 def sample_surface(

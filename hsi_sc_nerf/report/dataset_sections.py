@@ -65,13 +65,11 @@ def effects_section(dataset: PackedDataset) -> list[Section]:
     """The effects of the session by their evidence; nothing of a dataset without any."""
     if not dataset.effects:
         return []
-    rows = [
-        (*row, effect.sentence) for row, effect in zip(effect_rows(dataset.effects), dataset.effects, strict=True)
-    ]
+    sentences = (effect.sentence for effect in dataset.effects)
+    rows = [(*row, sentence) for row, sentence in zip(effect_rows(dataset.effects), sentences, strict=True)]
     table = Table("Effects of the session, and their evidence.", (*EFFECT_COLUMNS, ""), rows)
-    return [
-        Section("effects", "Effects", [table, *_folded_picture(dataset, "effects.png", "Evidence over threshold")])
-    ]
+    picture = _folded_picture(dataset, "effects.png", "Evidence over threshold")
+    return [Section("effects", "Effects", [table, *picture])]
 
 
 def calibration_section(dataset: PackedDataset) -> Section:
