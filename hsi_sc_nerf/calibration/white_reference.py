@@ -38,7 +38,7 @@ class White:
 
     Attributes:
         measured: mean counts above dark before smoothing; nan in bad bands and, with one column for each sample, in
-            dead elements.
+            dead and saturated elements.
         spectrum: mean counts above dark after smoothing.
         pixels: pixels averaged for each column.
         window_bands: bands averaged by smoothing for each band; 0 in bad bands.
@@ -160,6 +160,8 @@ def column_white(white: Cube, dark: Cube | None, samples: int, defects: Defects 
     else:
         measured, pixels = readings.mean_spectrum(dark_spectra)[None], everywhere.size
     bad_bands = _bad_bands(white, measured, readings, defects)
+    if width == samples:  # a column may be saturated in a band of which it is a small part
+        measured[readings.saturated > MAX_SATURATED * readings.numbers] = np.nan
     measured = np.where(bad_bands | ~(measured > 0.0), np.nan, measured)
     spectrum, window_bands = smooth_spectrum(measured, white.wavelengths_nm)
     return White(measured, spectrum, pixels, window_bands.max(axis=0), bad_bands)

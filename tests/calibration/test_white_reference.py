@@ -268,6 +268,16 @@ def test_white_of_a_capture_by_detector_column(tmp_path):
     np.testing.assert_allclose(one.spectrum[0], np.nanmean(expected, axis=0)[None][0])
 
 
+def test_a_column_that_saturates_on_its_white_has_none(tmp_path):
+    """One column of many hardly counts in its band."""
+    slab = np.broadcast_to(LAMP, (3, 200, 7)).copy()
+    slab[:, 20, 3], slab[0, 30, 3] = 4000.0, 4000.0
+    found = defects(200, saturation_counts=4000.0)
+    white = column_white(cube_of(tmp_path, "WHITEREF", slab), None, 200, found)
+    assert not white.bad_bands.any()
+    np.testing.assert_array_equal(np.argwhere(np.isnan(white.spectrum)), [[20, 3], [30, 3]])
+
+
 @pytest.mark.parametrize(("gap", "header"), [(-1.0, {"data ignore value": -1}), (np.nan, {})])
 def test_white_of_one_line_leaves_no_data_out(tmp_path, gap, header):
     slab = np.broadcast_to(LAMP, (2, 5, 7)).copy()
