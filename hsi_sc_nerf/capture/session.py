@@ -35,7 +35,7 @@ class Capture:
     Attributes:
         name: name of the folder or the file.
         cube: the raw counts, or ``product`` if there are none (``has_counts`` is False).
-        dark: counts without light, at the integration time of ``cube``.
+        dark: counts without light, at the integration time of ``cube``; None, as is ``white``, without raw counts.
         white: WHITEREF, counts of a white.
         white_dark: counts without light that belong to ``white``; the capture's own dark if that fits.
         product: REFLECTANCE, the reflectance that the instrument computed.
@@ -281,10 +281,11 @@ def open_captures(
 def _capture(files: CaptureFiles, cubes: dict[str, Cube]) -> Capture:
     """A capture of opened cubes. Its XML is read only if it is needed."""
     counts, dark, white, product = (cubes.get(role) for role in ("counts", "dark", "white", "product"))
-    needs_metadata = white is not None or (counts and counts.integration_time_ms is None)
+    if counts is None:  # the references of counts that are not there
+        return Capture(files.name, cubes["product"], product=product)
+    needs_metadata = white is not None or counts.integration_time_ms is None
     metadata = read_metadata(files.metadata) if files.metadata is not None and needs_metadata else None
-    cube = counts or cubes["product"]
-    capture = Capture(files.name, cube, dark, white, product=product, metadata=metadata)
+    capture = Capture(files.name, counts, dark, white, product=product, metadata=metadata)
     if white is None:
         return capture
     if metadata is not None and metadata.white_mode == "simultaneous":

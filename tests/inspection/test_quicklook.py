@@ -65,15 +65,21 @@ def test_a_panel_whose_reflectance_is_known(session):
     assert brightness(session) == pytest.approx(expected, rel=0.02)
 
 
-def test_finished_reflectance_beside_a_raw_white(session):
+@pytest.mark.parametrize("references", [False, True])
+def test_finished_reflectance_beside_a_raw_white(session, references):
+    """Of the counts, which take the most room, only their dark cubes may be left."""
     expected = brightness(session)
     for number, image in enumerate(rendered(12)):
         name = f"fruit_{number:02d}"
         shutil.rmtree(session / name)
         product = session / name / "results" / f"REFLECTANCE_{name}.hdr"
         write_cube(product, image.astype(np.float32), wavelengths_nm=WAVELENGTHS_NM)
+        if references:
+            header = session / name / "capture" / f"DARKREF_{name}.hdr"
+            write_cube(header, np.full((1, *image.shape[1:]), 100, np.uint16), wavelengths_nm=WAVELENGTHS_NM)
     inspection = inspect_session(open_session(session))
     assert inspection.session.white is not None
+    assert {frame.dark for frame in inspection.session.frames} == {None}
     # The brightest part of a frame is paper.
     assert inspection.quicklooks[0].picture.mean() == pytest.approx(expected / 0.76, rel=0.2)
     assert inspection.markers.usual_step_deg == pytest.approx(30.0, abs=0.5)
