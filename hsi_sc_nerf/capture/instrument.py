@@ -166,11 +166,10 @@ def _list_plain(path: Path, found: Listing) -> None:
     for named in _in_natural_order(map(Path, names.values())):
         dark = {"dark": shared_dark[0]} if shared_dark else {}
         found.captures.append(CaptureFiles(named.name, {**dark, **_of_capture(named.name, headers)}))
-    known = {suffix for suffix in DATA_SUFFIXES if suffix}
+    described = {header.stem.lower() for header in headers.values()}
     for file in _in_natural_order(path.iterdir()):
-        if file.suffix.lower() in known and not {file.name.lower(), file.stem.lower()} & {
-            header.stem.lower() for header in headers.values()
-        }:
+        is_data = file.suffix.lower() in DATA_SUFFIXES[1:] and not file.name.startswith(".")
+        if is_data and not {file.name.lower(), file.stem.lower()} & described:
             found.damaged[file.name] = f"{file}: has no header {file.stem}.hdr; copy it there"
 
 

@@ -183,6 +183,8 @@ def test_a_damaged_white_is_not_left_out(tmp_path):
 def test_everything_in_the_folder_is_accounted_for(tmp_path, specim):
     write_session(tmp_path, specim=specim)
     (tmp_path / "notes").mkdir()
+    for ending in ("hdr", "raw"):  # as macOS leaves them on a memory card
+        (tmp_path / f"._ball_1.{ending}").write_bytes(b"\0\5\x16\7")
     session = open_session(tmp_path, exclude=["ball_3"])
     assert [frame.name for frame in session.frames] == ["ball_1", "ball_2", "ball_4"]
     assert (session.excluded, list(session.skipped)) == (("ball_3",), ["notes"])
