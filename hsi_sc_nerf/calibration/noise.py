@@ -167,6 +167,7 @@ def read_noise(
     variance = dark.var(axis=0, ddof=1, dtype=np.float64)
     if dead is not None:
         variance[dead] = np.nan
+    variance[:, np.isnan(variance).all(axis=0)] = 0.0  # a bad band has no median
     if not np.nansum(variance) > 0.0:
         return None
     degrees = lines - 1

@@ -246,6 +246,7 @@ def test_drift_is_taken_off_where_one_white_was_copied_beside_every_frame(tmp_pa
     assert ("every frame has a white of its own" in told) != copies
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_a_band_without_data_leaves_the_uncertainty_of_the_others(tmp_path):
     scene = override(load_scene("sphere"), size_px=48, bands=12, frames=3, effects=["photon_noise", "read_noise"])
     session = open_session(simulate_session(scene, tmp_path / "session", progress=False))
