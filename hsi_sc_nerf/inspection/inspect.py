@@ -91,7 +91,7 @@ def inspect_session(
     of_white = check_white(session, white_source)  # first: it refuses a session without a white
     quicklooks = quicklooks_of(session)
     markers = find_markers(session, quicklooks)
-    session, upright = _upright(session, markers)
+    session, upright = _upright(session, markers, poses)
     suggested = filled_in(session, markers)
     findings = [
         *check_files(session, skip_damaged),
@@ -108,8 +108,12 @@ def inspect_session(
     return Inspection(session, quicklooks, markers, findings, suggested)
 
 
-def _upright(session: Session, markers: Markers) -> tuple[Session, Finding]:
-    """The session with the rotation of its images by its markers, unless ``session.json`` states one."""
+def _upright(session: Session, markers: Markers, poses: PoseMethod) -> tuple[Session, Finding]:
+    """The session with the rotation of its images by its markers, unless ``session.json`` states one.
+
+    Markers tell which way is up, whatever is stated. Other poses take it from the images: upside down, they would set
+    the object on its head.
+    """
     measured = markers.rotation_deg
     values = {"stated_deg": session.info.image_rotation_deg, "measured_deg": measured}
     assumed = session.image_rotation_deg
@@ -122,7 +126,8 @@ def _upright(session: Session, markers: Markers) -> tuple[Session, Finding]:
             f"{session.info_path}: states image_rotation_deg {assumed}, but by the markers it is {measured}; correct "
             "it, or leave it out."
         )
-        return session, Finding("upright", "amber", sentence, values)
+        is_spoilt = poses in ("colmap", "angles") and abs(measured - assumed) == 180
+        return session, Finding("upright", "red" if is_spoilt else "amber", sentence, values)
     sentence = f"Upright: images are rotated by {measured} degrees, as the markers show."
     return replace(session, image_rotation_deg=measured), Finding("upright", "green", sentence, values)
 

@@ -277,13 +277,19 @@ def test_upright_is_measured_and_goes_before_the_instruments_habit(tmp_path, qua
 
 
 @pytest.mark.parametrize(
-    ("spoil", "name"),
-    [({"direction": "cw"}, "turn"), ({"image_rotation_deg": 90}, "upright")],
+    ("spoil", "poses", "name", "level"),
+    [
+        ({"direction": "cw"}, "auto", "turn", "red"),
+        ({"image_rotation_deg": 90}, "colmap", "upright", "amber"),
+        ({"image_rotation_deg": 180}, "auto", "upright", "amber"),
+        ({"image_rotation_deg": 180}, "colmap", "upright", "red"),
+        ({"image_rotation_deg": 180}, "angles", "upright", "red"),
+    ],
 )
-def test_session_json_that_the_markers_contradict(session, spoil, name):
+def test_session_json_that_the_markers_contradict(session, spoil, poses, name, level):
     (session / "session.json").write_text(json.dumps({**INFO, **spoil}))
-    _, findings = inspect(session)
-    assert findings[name].level == ("red" if name == "turn" else "amber")
+    findings = inspect_session(open_session(session), poses).findings
+    assert [finding.level for finding in findings if finding.name == name] == [level]
 
 
 @pytest.mark.slow
