@@ -18,7 +18,7 @@ from hsi_sc_nerf.calibration.detector import light_of_some_lines, unlit_bands
 from hsi_sc_nerf.calibration.lamp_drift import NotMeasurable
 from hsi_sc_nerf.calibration.reflectance import PixelCounts
 from hsi_sc_nerf.calibration.session_calibration import SessionCalibration
-from hsi_sc_nerf.calibration.white_reference import TARP_BRIGHTNESS
+from hsi_sc_nerf.calibration.white_reference import bright_region
 from hsi_sc_nerf.calibration.white_source import (
     WhiteSource,
     exposure_ratio,
@@ -28,7 +28,6 @@ from hsi_sc_nerf.calibration.white_source import (
 )
 from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.findings import Finding, Level
-from hsi_sc_nerf.morphology import largest_component
 
 ABOVE_WHITE = 1.05
 """Reflectance that counts as brighter than the white: noise and uneven light alone lift a white wall just above 1."""
@@ -124,9 +123,8 @@ def _check_tarp(session: Session) -> tuple[str | None, float, dict[str, object]]
     assert tarp is not None
     light = light_of_some_lines(tarp.cube, tarp.dark)
     image = light.mean(axis=-1)
-    brightest = np.percentile(image, 99.0)
-    region = largest_component(image >= TARP_BRIGHTNESS * brightest)
-    if not brightest > 0.0:
+    region = bright_region(image)
+    if not region.any():
         return f"the white {tarp.name} is dark; take it again", 0.0, {}
     white = np.median(light[region], axis=0)
     perfect = white / panel_reflectance(session)

@@ -181,21 +181,18 @@ def tarp_roi(capture: Capture, defects: Defects | None = None) -> Roi:
         used = live if missing is None else live & ~missing
         # A sample without any usable reading is dark.
         brightness.append(np.where(used, line, 0).sum(axis=-1, dtype=np.float64) / np.maximum(used.sum(axis=-1), 1))
-    roi = find_coarse_roi(np.stack(brightness))
-    if roi is None:
+    y, x = np.nonzero(bright_region(np.stack(brightness)))
+    if not len(y):
         raise InputError(
             f"{cube.header_path}: the tarp has no usable region, because the image is dark; take it again."
         )
-    return roi
-
-
-def find_coarse_roi(brightness: Num[np.ndarray, "lines samples"]) -> Roi | None:
-    """Step 1: bounding box of the largest bright region; None if nothing is brighter than zero."""
-    reference = np.percentile(brightness, 99.0)
-    if not reference > 0.0:
-        return None
-    y, x = np.nonzero(largest_component(brightness >= TARP_BRIGHTNESS * reference))
     return int(x.min()), int(y.min()), int(x.max()) + 1, int(y.max()) + 1
+
+
+def bright_region(brightness: Num[np.ndarray, "lines samples"]) -> Bool[np.ndarray, "lines samples"]:
+    """The largest bright region of an image, which a tarp is in its own; empty if nothing is brighter than zero."""
+    reference = np.percentile(brightness, 99.0)
+    return largest_component((brightness >= TARP_BRIGHTNESS * reference) & (reference > 0.0))
 
 
 def deviation_map(

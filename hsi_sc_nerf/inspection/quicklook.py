@@ -24,6 +24,7 @@ from hsi_sc_nerf.calibration.detector import (
     spread_rows,
 )
 from hsi_sc_nerf.calibration.reference_checks import bright_pixels
+from hsi_sc_nerf.calibration.white_reference import bright_region
 from hsi_sc_nerf.calibration.white_source import exposure_ratio, panel_reflectance
 from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.poses.session_pictures import edge_slope
@@ -36,11 +37,9 @@ NEIGHBOURS = 2
 """Number of neighbouring bands averaged into a channel of a picture; they lie side by side in the file."""
 DARK_SIGMAS = 3.0
 """A value is dark if it exceeds the dark cube by less than this many standard deviations."""
-BRIGHT_PERCENTILE = 95.0
-"""Percentile of a picture that counts as its brighter part."""
 MARKERS_PERCENTILE = 99.5
-"""Percentile of a picture that is white where markers are sought: in a dark chamber, paper may fill less than the
-brighter part, and highlights fill less than the rest."""
+"""Percentile of a picture that is white where markers are sought: in a dark chamber, paper may fill little of it, and
+highlights fill less than the rest."""
 WORKERS = 2
 
 
@@ -50,7 +49,7 @@ class Quicklook:
 
     Attributes:
         name: name of the capture.
-        picture: pseudo-RGB reflectance; without a white, relative to the brightest part.
+        picture: pseudo-RGB reflectance; without a white, relative to its largest bright region.
         top_counts: the largest reading of the lines read.
         at_top_fraction: fraction of the readings with ``top_counts``, by band.
         dark_fraction: fraction of the readings without light, by band.
@@ -129,7 +128,7 @@ def white_levels(session: Session) -> list[Float[np.ndarray, "bands"]]:
     """Counts above dark that are a reflectance of 1 in each frame, by band.
 
     They are those of the tarp at the frame's integration time, over its own reflectance. Without a tarp, or without
-    raw counts, the brightest part of the first frame is taken for white.
+    raw counts, the largest bright region of the first frame is taken for white.
     """
     if session.white is None or not session.has_counts:
         return [white_counts(session.frames[0])] * len(session.frames)
@@ -138,8 +137,10 @@ def white_levels(session: Session) -> list[Float[np.ndarray, "bands"]]:
 
 
 def white_counts(capture: Capture) -> Float[np.ndarray, "bands"]:
-    """Counts above dark of the brightest part of a capture, by band."""
-    level = np.percentile(light_of_some_lines(capture.cube, capture.dark), BRIGHT_PERCENTILE, axis=(0, 1))
+    """Counts above dark of the largest bright region of a capture, by band: of a tarp in its own."""
+    light = light_of_some_lines(capture.cube, capture.dark)
+    region = bright_region(light.mean(axis=-1))
+    level = np.median(light[region if region.any() else ~region], axis=0)
     return np.maximum(level, 1e-3 * max(float(level.max()), 1e-9))
 
 

@@ -17,7 +17,7 @@ from hsi_sc_nerf.calibration.detector import (
     saturation_counts,
     unlit_bands,
 )
-from hsi_sc_nerf.calibration.white_reference import find_coarse_roi
+from hsi_sc_nerf.calibration.white_reference import bright_region
 from hsi_sc_nerf.simulate.frames import Simulation
 from hsi_sc_nerf.simulate.scene import load_scene, override, read_effects
 
@@ -39,11 +39,11 @@ def session(name="pear", size_px=64, bands=204, seed=0, bit_depth=12, **effects)
 def readings(simulation, lines_of_frames=8):
     """Lines across the tarp, and a few of each frame."""
     white = simulation.white()
-    roi = find_coarse_roi(white.counts.mean(axis=-1))
+    on_tarp = bright_region(white.counts.mean(axis=-1)).any(axis=1)
     frames = [simulation.frame(number) for number in range(3)]
     step = len(white.counts) // lines_of_frames
     return (
-        Readings(white.counts[roi[1] : roi[3]], white.dark),
+        Readings(white.counts[on_tarp], white.dark),
         [Readings(frame.counts[step // 2 :: step], frame.dark) for frame in frames],
     )
 

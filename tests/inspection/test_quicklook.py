@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from inspection_session import INFO, WAVELENGTHS_NM, rendered, write_white
+from inspection_session import INFO, WAVELENGTHS_NM, rendered, write_one, write_white
 
 from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.capture.session import open_session
@@ -55,6 +55,19 @@ def test_frames_that_were_exposed_longer_or_shorter_than_the_white(session, time
     assert reflectance_noise(open_session(session)) == pytest.approx(noise, rel=0.1)
     levels = {finding.name: finding.level for finding in inspect_session(open_session(session)).findings}
     assert (levels["markers"], levels["turn"], levels["paper"]) == ("green", "green", "green")
+
+
+@pytest.mark.parametrize(("side_px", "glare_lines"), [(25, 0), (60, 8)])
+def test_a_white_that_fills_little_of_a_dark_chamber(session, side_px, glare_lines):
+    """It is neither darker because of the chamber, nor brighter because of what mirrors a lamp beside it."""
+    expected = brightness(session)
+    white = np.full((128, 128, len(WAVELENGTHS_NM)), 0.02)
+    white[40 : 40 + side_px, 40 : 40 + side_px] = WHITE
+    white[110 : 110 + glare_lines] = 1.4
+    write_one(session, "white_reference", white)
+    assert brightness(session) == pytest.approx(expected, rel=0.03)
+    red = [found.name for found in inspect_session(open_session(session)).findings if found.level == "red"]
+    assert red == []
 
 
 def test_a_panel_whose_reflectance_is_known(session):
