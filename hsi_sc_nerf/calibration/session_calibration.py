@@ -17,6 +17,7 @@ from hsi_sc_nerf.calibration.detector import (
     dark_counts,
     fill_no_data,
     find_defects,
+    light_above,
     no_data,
     pooled_darks,
     spread_rows,
@@ -90,7 +91,8 @@ class SessionCalibration:
         noise: noise of a reading; None for "product".
         drift_corrected: whether the frames are divided by it.
         one_white: whether all frames are divided by one white, so that the lamps' drift is in their reflectance.
-        uncertainty: of reflectance in the kept bands; None for "product", and where the noise is unknown.
+        uncertainty: of reflectance in the kept bands, of the frames that were exposed shortest; None for "product",
+            and where the noise is unknown.
     """
 
     source: WhiteSource
@@ -291,10 +293,8 @@ def _defects(session: Session, source: WhiteSource, config: CalibrationConfig) -
 def _brightest_lines(cube: Cube) -> Int[np.ndarray, "rows"]:
     """The lines of the brightest readings in some bands: highlights are small. Hot elements are hot in all lines."""
     bands = np.unique(np.linspace(0, cube.shape[2] - 1, HIGHLIGHT_BANDS).round().astype(int))
-    counts = np.stack([np.asarray(cube.memmap()[:, :, band], np.float32) for band in bands])
-    missing = no_data(counts, cube.ignore_value)
-    if missing is not None:
-        counts = np.where(missing, 0.0, counts)
+    of_bands = np.stack([np.asarray(cube.memmap()[:, :, band], np.float32) for band in bands])
+    counts = light_above(of_bands, None, cube.ignore_value)
     brighter = counts - np.median(counts, axis=1, keepdims=True)
     return np.unique(brighter.max(axis=2).argmax(axis=1))
 
@@ -345,6 +345,6 @@ def _uncertainty(
         frame_dark_readings=0 if capture.dark is None else capture.dark.shape[0],
         white_dark_readings=0 if dark is None else dark.shape[0] * int(columns),
         panel_reflectance=panel,
-        integration_ratio=white_exposure_ratio(session, source, capture),
+        integration_ratio=max(white_exposure_ratio(session, source, frame) for frame in session.frames),
     )
     return ReflectanceUncertainty(everywhere.constant[kept], everywhere.linear[kept], everywhere.quadratic[kept])

@@ -246,6 +246,18 @@ def test_drift_is_taken_off_where_one_white_was_copied_beside_every_frame(tmp_pa
     assert ("every frame has a white of its own" in told) != copies
 
 
+def test_the_uncertainty_is_that_of_the_shortest_exposure_whichever_frame_it_is(tmp_path):
+    scene = override(load_scene("sphere"), size_px=32, bands=8, frames=3, effects=["photon_noise", "read_noise"])
+    session = open_session(simulate_session(scene, tmp_path / "session", progress=False))
+    usual = calibrate_session(session, CalibrationConfig()).uncertainty
+    cube = session.frames[1].cube
+    short = replace(session.frames[1], cube=replace(cube, integration_time_ms=cube.integration_time_ms / 4.0))
+    frames = (session.frames[0], short, session.frames[2])
+    found = calibrate_session(replace(session, frames=frames), CalibrationConfig()).uncertainty
+    np.testing.assert_allclose(found.constant, 16.0 * usual.constant)
+    np.testing.assert_allclose(found.linear, 4.0 * usual.linear)
+
+
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_a_band_without_data_leaves_the_uncertainty_of_the_others(tmp_path):
     scene = override(load_scene("sphere"), size_px=48, bands=12, frames=3, effects=["photon_noise", "read_noise"])
