@@ -173,7 +173,7 @@ def open_session(path: Path, *, exclude: Collection[str] = (), skip_damaged: boo
 
     Raises:
         InputError: no such folder; fewer than two frames; captures that cannot be opened, or differ from most in
-            shape or bands; or a ``session.json`` that cannot be used.
+            shape or bands; or a ``session.json`` that cannot be used, or names a white that is not there.
 
     Example:
         >>> session = open_session(Path("captures"))
@@ -199,6 +199,12 @@ def open_session(path: Path, *, exclude: Collection[str] = (), skip_damaged: boo
     captures = [capture for capture in opened if capture.name not in exclude]
     info = replace(info, white_reference=white_name(info, [*(files.name for files in kept), *damaged]))
     white = info.white_reference.lower()
+    of_all = {name.lower() for name in (*(files.name for files in found.captures), *found.damaged)}
+    if white not in of_all and info.white_reference != SessionInfo.white_reference:
+        raise InputError(
+            f"{path / SESSION_INFO_NAME}: names {info.white_reference} as white_reference, but there is no such "
+            "capture; correct the name, or leave it out."
+        )
     broken_white = next((reason for name, reason in damaged.items() if name.lower() == white), None)
     if broken_white is None and damaged and not captures:  # all for the same reason, most likely
         broken_white = next(iter(damaged.values()))

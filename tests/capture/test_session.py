@@ -198,6 +198,15 @@ def test_a_cube_without_header_is_named(tmp_path):
     assert list(open_session(tmp_path, skip_damaged=True).damaged) == ["ball_3.raw"]
 
 
+def test_a_white_that_is_stated_but_not_there_is_not_replaced_by_another(tmp_path):
+    write_session(tmp_path, info={**INFO, "white_reference": "ball_33"})
+    for number in range(1, 5):
+        white = tmp_path / f"ball_{number}" / "capture" / f"WHITEREF_ball_{number}.hdr"
+        write_cube(white, COUNTS[:2], wavelengths_nm=WAVELENGTHS_NM)
+    with pytest.raises(InputError, match=r"session\.json: names ball_33 as white_reference, but there is no such"):
+        open_session(tmp_path)
+
+
 @pytest.mark.parametrize(("others", "white"), [((), "Tarp_2"), (("panel",), None)])
 def test_a_white_is_known_by_its_name_if_it_is_the_only_one(tmp_path, others, white):
     for name in ("a", "b", "Tarp_2", *others):
