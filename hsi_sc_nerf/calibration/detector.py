@@ -90,10 +90,6 @@ class Readings:
         """Mean counts above dark over the lines."""
         return self.counts.mean(axis=0, dtype=np.float64) - dark_columns(self.dark, *self.counts.shape[1:])
 
-    def resolution(self) -> float:
-        """Step between counts: 1 for integers, 0 for other numbers."""
-        return 1.0 if self.counts.dtype.kind in "iu" else 0.0
-
 
 def find_defects(
     white: Readings, frames: Sequence[Readings] = (), *, good_bands: Bool[np.ndarray, "bands"] | None = None
@@ -106,10 +102,10 @@ def find_defects(
         good_bands: the header's bad-band list ``bbl``.
     """
     white_light = white.light()
-    images = [(white_light, white.resolution())]
+    step = float(any(readings.counts.dtype.kind in "iu" for readings in (white, *frames)))
+    images = [(white_light, step)]
     if frames:
-        frame_light = np.mean([readings.light() for readings in frames], axis=0)
-        images.append((frame_light, max(readings.resolution() for readings in frames)))
+        images.append((np.mean([readings.light() for readings in frames], axis=0), step))
     dead = elements_without_response(images)
     for readings in (white, *frames):
         dead |= readings.without_dark()

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Num
 
 from hsi_sc_nerf.calibration.detector import Defects, dark_columns, dark_counts
-from hsi_sc_nerf.calibration.white_reference import TARP_BRIGHTNESS, WhiteReference, mean_over_columns
+from hsi_sc_nerf.calibration.white_reference import TARP_BRIGHTNESS, WhiteReference, dead_elements, mean_over_columns
 from hsi_sc_nerf.capture.session import Capture
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.morphology import dilate, largest_component
@@ -46,9 +46,7 @@ def flat_field(
         )
     counts = tarp.cube.memmap()
     samples, bands = counts.shape[1:]
-    use = np.broadcast_to(~white.bad_bands, (samples, bands))
-    if defects is not None:
-        use = use & ~defects.dead
+    use = ~white.bad_bands & ~dead_elements(defects, samples, bands)
     dark = dark_columns(dark_counts(tarp.dark), samples, bands)
     brightness = relative_brightness(counts, dark, np.nan_to_num(mean_over_columns(white.measured)), use)
     region = np.zeros(brightness.shape, bool)

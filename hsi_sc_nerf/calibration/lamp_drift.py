@@ -71,11 +71,6 @@ class LampDriftEstimate:
         """Whether ``p_value`` is below ``SIGNIFICANCE``."""
         return self.p_value < SIGNIFICANCE
 
-    @property
-    def static_fraction(self) -> float:
-        """Fraction of the surveyed pixels that is static."""
-        return float(self.static.mean())
-
 
 @dataclass(frozen=True)
 class NotMeasurable:

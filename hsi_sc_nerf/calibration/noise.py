@@ -80,7 +80,7 @@ def measure_noise(
     level = dark_columns(dark, *white.shape[1:])
     # Without the dark level, the white's counts do not tell how many of them are photons.
     known = rounding if dark is None else measured
-    transfer = photon_transfer(
+    slope, of_white = photon_transfer(
         white,
         region,
         level,
@@ -88,13 +88,9 @@ def measure_noise(
         saturation_counts=saturation_counts,
         dead=dead,
         rounding_variance=rounding_variance,
-    )
-    if transfer is None:
-        slope = None
-    else:
-        slope, of_white = transfer
-        if measured is None and of_white is not None:
-            measured = np.full(bands, of_white)
+    ) or (None, None)
+    if measured is None and of_white is not None:
+        measured = np.full(bands, of_white)
     deviation = rounding if measured is None else np.maximum(measured, rounding)
     return NoiseModel(deviation, slope or 0.0, measured is not None, slope is not None)
 

@@ -10,7 +10,6 @@ relative to the white comes from a lamp that was on for one of the two only.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -64,9 +63,9 @@ def check_dark(
     if found == "product":
         return Finding("dark", "green", "The instrument's finished reflectance needs no dark reference.")
     exposures = _exposures(session, found)
-    without = [exposure.name for exposure in exposures if exposure.dark is None]
+    without = [name for name, _, _, dark in exposures if dark is None]
     if len(without) == len(exposures):
-        return _without_any(session, exposures)
+        return _without_any(session, [counts for _, counts, _, _ in exposures])
     if without:
         sentence = (
             f"{session.path}: {names_in_short(without)} {'has' if len(without) == 1 else 'have'} no dark reference, "
@@ -77,13 +76,16 @@ def check_dark(
         return Finding("dark", "red", f"{sentence}{advice}.", {"without": without})
     # With a target, this is the brightest part of the first frame.
     white = np.percentile(some_lines(white_cubes(session, found)[0]), 95.0, axis=(0, 1))
-    with_data, lit = ~unlit_bands(white[None]), {}
-    for exposure in exposures:
-        assert exposure.dark is not None
-        dark = (spectra or {}).get(exposure.name)
+    with_data, lit, other = ~unlit_bands(white[None]), {}, []
+    for name, _, counts_ms, cube in exposures:
+        assert cube is not None
+        dark = (spectra or {}).get(name)
         if dark is None:
-            dark = some_lines(exposure.dark).mean(axis=(0, 1))
-        lit[exposure.name] = light_over_white(dark[with_data], white[with_data])
+            dark = some_lines(cube).mean(axis=(0, 1))
+        lit[name] = light_over_white(dark[with_data], white[with_data])
+        dark_ms = cube.integration_time_ms
+        if dark_ms and counts_ms and max(dark_ms, counts_ms) > DIFFERENT_TIME * min(dark_ms, counts_ms):
+            other.append(name)
     values: dict[str, object] = {"light_over_white": {name: round(value, 5) for name, value in lit.items()}}
     shining = [name for name, value in lit.items() if value > LIT_AMBER]
     if shining:
@@ -94,7 +96,6 @@ def check_dark(
             "or copy that of another capture."
         )
         return Finding("dark", "red" if most > LIT_RED else "amber", sentence, values)
-    other = [exposure.name for exposure in exposures if exposure.other_time]
     if other:
         sentence = (
             f"{session.path}: by their headers the dark references of {names_in_short(other)} have another "
@@ -148,31 +149,13 @@ def check_lines(
     return [judged("light-lines", float(np.abs(height[worst])), limits, f"{session.path}: {text}", advice)]
 
 
-@dataclass(frozen=True, eq=False)
-class _Exposure:
-    """Counts and the dark reference that is subtracted from them."""
-
-    name: str
-    counts: Cube
-    counts_ms: float | None
-    dark: Cube | None
-
-    @property
-    def other_time(self) -> bool:
-        """Whether the headers state different integration times for the two."""
-        dark_ms = None if self.dark is None else self.dark.integration_time_ms
-        if dark_ms is None or self.counts_ms is None:
-            return False
-        return max(dark_ms, self.counts_ms) > DIFFERENT_TIME * min(dark_ms, self.counts_ms)
-
-
-def _exposures(session: Session, source: WhiteSource) -> list[_Exposure]:
-    """What a dark reference is subtracted from."""
+def _exposures(session: Session, source: WhiteSource) -> list[tuple[str, Cube, float | None, Cube | None]]:
+    """What a dark reference is subtracted from: its name, counts and integration time (ms), and that reference."""
     captures = session.captures if source == "tarp" else session.frames
-    found = [_Exposure(c.name, c.cube, c.integration_time_ms, c.dark) for c in captures]
+    found = [(c.name, c.cube, c.integration_time_ms, c.dark) for c in captures]
     if source == "capture":
         found += [
-            _Exposure(f"WHITEREF_{c.name}", c.white, c.white_integration_time_ms, c.white_dark)
+            (f"WHITEREF_{c.name}", c.white, c.white_integration_time_ms, c.white_dark)
             for c in captures
             if c.white is not None
         ]
@@ -197,9 +180,9 @@ def light_over_white(dark: Float[np.ndarray, "bands"], white: Float[np.ndarray, 
     return slope if slope > CERTAINTY * error else 0.0
 
 
-def _without_any(session: Session, exposures: Sequence[_Exposure]) -> Finding:
+def _without_any(session: Session, cubes: Sequence[Cube]) -> Finding:
     """No capture has a dark reference. This is right if the counts reach zero, because their offset was removed."""
-    some = [some_lines(exposure.counts) for exposure in exposures]
+    some = [some_lines(cube) for cube in cubes]
     lowest = min(float(np.percentile(counts, 0.1)) for counts in some)
     brightest = max(float(counts.max()) for counts in some)
     values = {"lowest": lowest, "brightest": brightest}

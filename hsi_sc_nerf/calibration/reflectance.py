@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Protocol
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, Num, UInt8, UInt16
 
 from hsi_sc_nerf import paper
+from hsi_sc_nerf.capture.envi import CubeLines
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, PixelFlag
 
 _BLOCK_LINES = 8
@@ -132,17 +132,8 @@ class PackedReflectance:
     binned: Float[np.ndarray, "bins lines samples"]
 
 
-class Lines(Protocol):
-    """Raw counts, one line ``(samples, bands)`` at a time: an array, or `CubeLines`."""
-
-    shape: tuple[int, int, int]
-    dtype: np.dtype
-
-    def __getitem__(self, line: int) -> Num[np.ndarray, "samples bands"]: ...
-
-
 def pack_counts(
-    counts: Lines,
+    counts: Num[np.ndarray, "lines samples bands"] | CubeLines,
     calibration: FrameCalibration,
     pictures: PictureBands,
     buffer: UInt16[np.ndarray, "values"] | None = None,
@@ -167,7 +158,7 @@ def pack_counts(
     file_bands = _as_slice(calibration.bands)
     dead, replaced_by = _dead_elements(calibration, samples)
     dead_at = np.flatnonzero(dead)
-    scale, offset = _line_constants(calibration, samples)
+    scale, offset = _line_constants(calibration, dead)
     flat = calibration.flat
     if flat is not None and not (np.isfinite(flat).all() and (flat > 0.0).all()):
         raise ValueError("the illumination is not positive everywhere")
@@ -257,19 +248,15 @@ def _dead_elements(
 
 
 def _line_constants(
-    calibration: FrameCalibration, samples: int
+    calibration: FrameCalibration, dead: Bool[np.ndarray, "kept samples"]
 ) -> tuple[Float[np.ndarray, "kept samples"], Float[np.ndarray, "kept samples"]]:
     """``scale`` and ``offset`` that turn a line's counts into packed numbers (plus a half without a flat field)."""
-    shape = (len(calibration.bands), samples)
     dark, gain = (
-        np.broadcast_to(array.T[calibration.bands], shape) for array in (calibration.dark, calibration.gain)
+        np.broadcast_to(array.T[calibration.bands], dead.shape) for array in (calibration.dark, calibration.gain)
     )
     scale = gain * float(REFLECTANCE_SCALE)
     offset = -dark * scale + (0.5 if calibration.flat is None else 0.0)
-    if calibration.dead is not None:
-        dead = calibration.dead.T[calibration.bands]
-        scale[dead] = 0.0
-        offset[dead] = 0.0
+    scale[dead] = offset[dead] = 0.0
     if not (np.isfinite(scale).all() and np.isfinite(offset).all()):
         raise ValueError("dark or gain is not finite at an element that is neither dead nor in a band left out")
     return scale.astype(np.float32), offset.astype(np.float32)

@@ -188,7 +188,7 @@ def draw_lamp_drift(
     by_band.fill_between(wavelengths_nm, low, high, color=COLOURS[0], alpha=0.3, linewidth=0)
     by_band.legend()
     by_band.set(xlabel="wavelength (nm)", ylabel="change in the last frame (%)")
-    by_band.set_title(f"Measured on {100.0 * drift.static_fraction:.0f} % of the surveyed pixels, which are static")
+    by_band.set_title(f"Measured on {100.0 * drift.static.mean():.0f} % of the surveyed pixels, which are static")
     for axes in (by_frame, by_band):
         axes.axhline(0.0, color="0.6", linewidth=0.8)
     save_figure(figure, path)
@@ -231,7 +231,7 @@ def _drift(session: Session, calibration: SessionCalibration) -> dict[str, Any]:
         "corrected": calibration.drift_corrected,
         "significant": drift.significant,
         "p_value": drift.p_value,
-        "static_fraction": drift.static_fraction,
+        "static_fraction": float(drift.static.mean()),
         "factor": {frame.name: row.tolist() for frame, row in zip(session.frames, factor, strict=True)},
         "standard_error": {frame.name: row.tolist() for frame, row in zip(session.frames, error, strict=True)},
     }

@@ -100,7 +100,7 @@ def white_reference(capture: Capture, roi: Roi | None = None, defects: Defects |
     x0, y0, x1, y1 = roi = roi or tarp_roi(capture, defects)
     require_inside(roi, cube)
     counts = np.ascontiguousarray(cube.memmap()[y0:y1, x0:x1], dtype=cube.dtype.newbyteorder("="))
-    dead = _dead(defects, samples, bands)[x0:x1]
+    dead = dead_elements(defects, samples, bands)[x0:x1]
     deviation = deviation_map(fill_no_data(counts, cube.ignore_value), dead)
     kernel_px = max(paper.WHITE_MORPHOLOGY_MIN_PX, min(counts.shape[:2]) // paper.WHITE_MORPHOLOGY_FRACTION)
     with np.errstate(invalid="ignore"):  # a white without counts deviates infinitely
@@ -151,7 +151,7 @@ def column_white(white: Cube, dark: Cube | None, samples: int, defects: Defects 
     counts = white.read()
     width, bands = counts.shape[1:]
     everywhere = np.ones(counts.shape[:2], bool)
-    readings = ElementSums.of(counts, everywhere, _dead(defects, width, bands), white.ignore_value, defects)
+    readings = ElementSums.of(counts, everywhere, dead_elements(defects, width, bands), white.ignore_value, defects)
     dark_spectra = dark_columns(dark_counts(dark), width, bands)
     if width == samples:
         with np.errstate(invalid="ignore"):
@@ -174,7 +174,7 @@ def tarp_roi(capture: Capture, defects: Defects | None = None) -> Roi:
         InputError: the image is dark.
     """
     cube = capture.cube
-    live = ~_dead(defects, *cube.shape[1:])
+    live = ~dead_elements(defects, *cube.shape[1:])
     brightness = []
     for line in cube.memmap():
         missing = no_data(line, cube.ignore_value)
@@ -287,7 +287,7 @@ def mean_over_columns(spectra: Float[np.ndarray, "columns bands"]) -> Float[np.n
         return np.where(known, spectra, 0.0).sum(axis=0) / known.sum(axis=0)
 
 
-def _dead(defects: Defects | None, samples: int, bands: int) -> Bool[np.ndarray, "samples bands"]:
+def dead_elements(defects: Defects | None, samples: int, bands: int) -> Bool[np.ndarray, "samples bands"]:
     """The dead elements; none if the defects are unknown or of another detector."""
     if defects is None or defects.dead.shape != (samples, bands):
         return np.zeros((samples, bands), bool)

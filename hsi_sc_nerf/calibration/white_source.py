@@ -15,6 +15,7 @@ from jaxtyping import Float
 from hsi_sc_nerf.calibration.detector import Defects
 from hsi_sc_nerf.calibration.white_reference import Roi, White, column_white, white_reference
 from hsi_sc_nerf.capture.envi import Cube
+from hsi_sc_nerf.capture.envi_header import SENSIBLE_NM
 from hsi_sc_nerf.capture.roles import copies_of_others
 from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.capture.session_info import SESSION_INFO_NAME
@@ -24,8 +25,6 @@ from hsi_sc_nerf.number_table import read_number_table
 WhiteSource = Literal["tarp", "capture", "target", "product"]
 LARGEST_FRACTION = 1.5
 """Reflectances are percent if any is larger than this, and fractions otherwise."""
-SHORTEST_NM = 100.0
-"""No imaging spectrometer measures shorter wavelengths; smaller numbers are not nanometres."""
 _FORMAT = "two columns, wavelength_nm and reflectance"
 
 
@@ -182,7 +181,7 @@ def _read(path: Path) -> tuple[Float[np.ndarray, "lines"], Float[np.ndarray, "li
     if len(columns) == 2 and "wavelength_nm" in columns:
         panel_nm = columns.pop("wavelength_nm")
         (reflectance,) = columns.values()
-    if panel_nm.min() < SHORTEST_NM:
+    if panel_nm.min() < SENSIBLE_NM[0]:
         raise InputError(f"{path}: gives {panel_nm.min():g} as a wavelength; write wavelengths in nm.")
     fractions = reflectance / 100.0 if reflectance.max() > LARGEST_FRACTION else reflectance
     if not (fractions.min() > 0.0 and fractions.max() <= LARGEST_FRACTION):

@@ -17,7 +17,6 @@ from spectral.io import envi
 
 from hsi_sc_nerf.errors import InputError
 
-INTERLEAVES = ("bil", "bip", "bsq")
 _FIELD = re.compile(r"^([^=\n{}]+)=[ \t]*(\{[^}]*\}|[^\n{]*$)[^\n]*$", re.MULTILINE)
 _REQUIRED = ("lines", "samples", "bands", "data type", "interleave")
 _NM_PER_UNIT = {
@@ -32,8 +31,8 @@ _NM_PER_UNIT = {
 }
 # ENVI's units that are no lengths.
 _NO_LENGTHS = ("wavenumber", "ghz", "mhz", "index")
-# No imaging spectrometer measures below 100 nm or beyond 100 µm. Smaller numbers without a unit are micrometres.
-_SENSIBLE_NM = (100.0, 100_000.0)
+SENSIBLE_NM = (100.0, 100_000.0)
+"""No imaging spectrometer measures below 100 nm or beyond 100 µm. Smaller numbers without a unit are micrometres."""
 # No instrument or library has more bands. Lists with one value a band are made before the data file's size is
 # checked.
 _MOST_BANDS = 100_000
@@ -164,7 +163,7 @@ def _check_layout(
     path: Path, fields: dict[str, Any], shape: tuple[int, int, int], dtype: np.dtype, offset: int, library: bool
 ) -> None:
     """Refuse headers whose pixels would be read wrongly."""
-    if fields["interleave"] not in INTERLEAVES:
+    if fields["interleave"] not in ("bil", "bip", "bsq"):
         raise InputError(f"{path}: interleave {fields['interleave']} is not bil, bip or bsq; correct it.")
     if min(shape) < 1 or offset < 0:
         raise InputError(
@@ -228,10 +227,10 @@ def _wavelengths(path: Path, fields: dict[str, Any], bands: int) -> tuple[float,
         return _NM_PER_UNIT.get(unit, 1.0), None
     if unit in _NO_LENGTHS:
         raise InputError(f"{path}: gives its bands in {unit}, not as wavelengths; convert the list to nm.")
-    implied = 1.0 if listed.max() >= _SENSIBLE_NM[0] else 1000.0
+    implied = 1.0 if listed.max() >= SENSIBLE_NM[0] else 1000.0
     nm_per_unit = _NM_PER_UNIT.get(unit, implied)
     wavelengths_nm = listed * nm_per_unit
-    if wavelengths_nm.min() < _SENSIBLE_NM[0] or wavelengths_nm.max() > _SENSIBLE_NM[1]:
+    if wavelengths_nm.min() < SENSIBLE_NM[0] or wavelengths_nm.max() > SENSIBLE_NM[1]:
         raise InputError(
             f"{path}: wavelengths from {wavelengths_nm.min():g} to {wavelengths_nm.max():g} nm are not those of an "
             "imaging spectrometer; correct the list or its unit."

@@ -98,7 +98,6 @@ def _without_digits(name: str) -> str:
 
 def _in_natural_order(paths: Iterable[Path]) -> list[Path]:
     """Sorted so that frame_9 comes before frame_10."""
-
     return sorted(paths, key=lambda path: natural_order(path.name))
 
 

@@ -256,31 +256,23 @@ def open_captures(
     headers: dict[str, dict[str, EnviHeader]] = {}
     by_band_count: dict[int, Float[np.ndarray, "bands"]] = {}
     opened: list[Capture] = []
-
-    def read_headers(files: CaptureFiles) -> None:
-        headers[files.name] = {role: with_band_widths(read_header(path)) for role, path in files.headers.items()}
-        for header in headers[files.name].values():
-            if header.wavelengths_nm is not None and listed_twice(header.wavelengths_nm) is None:
-                by_band_count.setdefault(header.shape[2], header.wavelengths_nm)
-
-    def open_cubes(files: CaptureFiles) -> None:
-        opened.append(
-            _capture(
-                files,
-                {
-                    role: open_cube(header, by_band_count.get(header.shape[2]) if listed is None else listed)
-                    for role, header in headers[files.name].items()
-                },
-            )
-        )
-
-    for step in (read_headers, open_cubes):
-        for files in captures:
-            if files.name not in damaged:
-                try:
-                    step(files)
-                except InputError as error:
-                    damaged[files.name] = str(error).removesuffix(".")
+    for files in captures:
+        try:
+            headers[files.name] = {role: with_band_widths(read_header(path)) for role, path in files.headers.items()}
+        except InputError as error:
+            damaged[files.name] = str(error).removesuffix(".")
+    for header in (header for by_role in headers.values() for header in by_role.values()):
+        if header.wavelengths_nm is not None and listed_twice(header.wavelengths_nm) is None:
+            by_band_count.setdefault(header.shape[2], header.wavelengths_nm)
+    for files in (files for files in captures if files.name in headers):
+        try:
+            cubes = {
+                role: open_cube(header, by_band_count.get(header.shape[2]) if listed is None else listed)
+                for role, header in headers[files.name].items()
+            }
+            opened.append(_capture(files, cubes))
+        except InputError as error:
+            damaged[files.name] = str(error).removesuffix(".")
     return opened
 
 

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from hsi_sc_nerf.capture.envi_header import SENSIBLE_NM
 from hsi_sc_nerf.errors import InputError, shown
 from hsi_sc_nerf.files import read_json
 from hsi_sc_nerf.number_table import read_number_table
@@ -19,12 +20,6 @@ from hsi_sc_nerf.spectra import listed_twice
 
 SESSION_INFO_NAME = "session.json"
 _FILES = ("band_centres", "panel_reflectance")
-_POSITIVE = (
-    *("nominal_step_deg", "marker_side_m", "camera_distance_m"),
-    *("container_diameter_m", "container_height_m"),
-)
-
-
 _LARGEST_M = {
     "marker_side_m": 0.5,
     "container_diameter_m": 3.0,
@@ -86,7 +81,7 @@ def read_session_info(path: Path) -> SessionInfo:
     for key, value in values.items():
         if key in _FILES and not os.path.isfile(path.parent / value):
             expected = f"the name of a CSV file beside {path.name}"
-        elif key in _POSITIVE and not value > 0.0:
+        elif key in ("nominal_step_deg", *_LARGEST_M) and not value > 0.0:
             expected = "a positive number"
         elif key in _LARGEST_M and value > _LARGEST_M[key]:
             expected = f"a length in metres, at most {_LARGEST_M[key]:g}"
@@ -120,7 +115,7 @@ def read_band_centres(path: Path) -> Float[np.ndarray, "bands"]:
         raise InputError(
             f"{path}: is not a list of band centres ({error}); write a line of names and one wavelength in nm a line."
         ) from error
-    if len(centres_nm) == 0 or not ((centres_nm >= 100.0) & (centres_nm <= 100_000.0)).all():
+    if len(centres_nm) == 0 or not SENSIBLE_NM[0] <= centres_nm.min() <= centres_nm.max() <= SENSIBLE_NM[1]:
         raise InputError(f"{path}: its band centres are not wavelengths in nm; write one number a line, from 100.")
     twice_nm = listed_twice(centres_nm)
     if twice_nm is not None:

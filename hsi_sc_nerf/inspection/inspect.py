@@ -233,9 +233,6 @@ def draw_inspection(inspection: Inspection, path: Path) -> None:
     thumbnails = [_thumbnail(np.rot90(q.picture, session.quarter_turns)) for q in quicklooks]
     height, width = thumbnails[0].shape[:2]
     sheet = np.ones((rows * height, THUMBNAIL_COLUMNS * width, 3), np.float32)
-    for index, thumbnail in enumerate(thumbnails):
-        top, left = index // THUMBNAIL_COLUMNS * height, index % THUMBNAIL_COLUMNS * width
-        sheet[top : top + height, left : left + width] = thumbnail
     lines: dict[str, Sequence[float]] = {
         "brightness": [float(q.picture.mean()) for q in quicklooks],
         "sharpness, 1/px": [q.sharpness_per_px for q in quicklooks],
@@ -244,18 +241,13 @@ def draw_inspection(inspection: Inspection, path: Path) -> None:
     with rc_context(STYLE):
         figure = new_figure(11.0, 1.0 + 11.0 / THUMBNAIL_COLUMNS * rows * height / width + 3.6)
         parts = figure.subplots(1 + len(lines), 1, height_ratios=[max(1.2 * rows, 1.2), 1, 1, 1])
-        show_image(parts[0], sheet)
         parts[0].set_title(session.path.resolve().name)
-        for index, name in enumerate(names):
-            parts[0].text(
-                index % THUMBNAIL_COLUMNS * width + 3,
-                index // THUMBNAIL_COLUMNS * height + 3,
-                name,
-                fontsize=6,
-                va="top",
-                color="white",
-                bbox={"color": COLOURS[1] if is_named(name, red) else "0.2", "pad": 1},
-            )
+        for index, (name, thumbnail) in enumerate(zip(names, thumbnails, strict=True)):
+            top, left = index // THUMBNAIL_COLUMNS * height, index % THUMBNAIL_COLUMNS * width
+            sheet[top : top + height, left : left + width] = thumbnail
+            box = {"color": COLOURS[1] if is_named(name, red) else "0.2", "pad": 1}
+            parts[0].text(left + 3, top + 3, name, fontsize=6, va="top", color="white", bbox=box)
+        show_image(parts[0], sheet)
         for axes, (label, values) in zip(parts[1:], lines.items(), strict=True):
             axes.plot(values, marker=".", color=COLOURS[0])
             axes.set(ylabel=label, ylim=(0, 1.1 * max(max(values), 1e-9)))

@@ -91,18 +91,14 @@ def find_markers(session: Session, quicklooks: Sequence[Quicklook]) -> Markers:
     if dictionary is not None:
         with ThreadPoolExecutor(WORKERS) as pool:
             detections = list(pool.map(partial(detect_markers, dictionary=dictionary), grays))
-    sides = [
-        float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).mean())
-        for seen in detections
-        for corners in seen.values()
-    ]
+    seen = [(index, *marker) for index, found in enumerate(detections) for marker in found.items()]
+    sides = [np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).mean() for _, _, corners in seen]
     errors = []
-    seen = [(index, marker) for index, found in enumerate(detections) for marker in found]
     for number in np.unique(np.linspace(0, max(len(seen) - 1, 0), FITTED_MARKERS).astype(int))[: len(seen)].tolist():
-        index, marker = seen[number]
+        index, marker, corners = seen[number]
         assert dictionary is not None
         image = quicklooks[index].picture.mean(axis=-1).astype(float)
-        fit = fit_marker(image, dictionary, marker, detections[index][marker])
+        fit = fit_marker(image, dictionary, marker, corners)
         if fit is not None:
             errors.append(float(np.sqrt(np.diag(fit.covariance_px2).mean())))
     markers = Markers(

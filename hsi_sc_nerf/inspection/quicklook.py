@@ -186,8 +186,4 @@ def _mean_counts(
     """Mean of the bands with data; a pixel without any is dark."""
     counts = np.asarray(counts, np.float32)
     missing = no_data(counts, ignore_value)
-    if missing is None:
-        return counts.mean(axis=-1)
-    number = (~missing).sum(axis=-1)
-    total = np.where(missing, 0.0, counts).sum(axis=-1)
-    return np.where(number > 0, total / np.maximum(number, 1), dark).astype(np.float32)
+    return np.ma.masked_array(counts, np.ma.nomask if missing is None else missing).mean(axis=-1).filled(dark)

@@ -152,7 +152,8 @@ class PixelSampler:
         on_boundary = 0
         if boundary_ray_fraction > 0.0 and sum(map(len, self._boundary)) > 0:
             on_boundary = round((count - in_foreground) * boundary_ray_fraction)
-        in_background, background_size = count - in_foreground - on_boundary, self._background_size
+        drawn, in_background = self._drawn_background, count - in_foreground - on_boundary
+        background_size = self.masks.size - len(self._foreground) if drawn is None else len(drawn)
         if in_background > 0 and background_size == 0:
             raise InputError(
                 "the masks of all training frames cover whole images, so that nothing tells where the object "
@@ -198,13 +199,6 @@ class PixelSampler:
         """Background pixels within ``BOUNDARY_PX`` of the foreground: off and on the outline (flat indices)."""
         near = np.stack([beside(mask, BOUNDARY_PX) for mask in self.masks])
         return np.flatnonzero(near & ~self._partly_covered), np.flatnonzero(self._partly_covered)
-
-    @property
-    def _background_size(self) -> int:
-        """How many background pixels are drawn from."""
-        if self._drawn_background is not None:
-            return len(self._drawn_background)
-        return self.masks.size - len(self._foreground)
 
     def _background(self, ranks: Int[np.ndarray, "count"]) -> Int[np.ndarray, "count"]:
         """Flat indices of the background pixels with these ranks.
