@@ -127,9 +127,13 @@ def session(tmp_path):
             write_capture(tmp_path, f"pear_{number}", expose(reflectance))
         write_capture(tmp_path, "white_reference", expose(white))
         opened = open_session(tmp_path)
-        return {finding.name: finding for finding in check_white(opened)}, opened
+        return found(opened), opened
 
     return write
+
+
+def found(opened, source="auto"):
+    return {finding.name: finding for finding in check_white(opened, source)}
 
 
 def levels(findings):
@@ -143,7 +147,7 @@ def test_a_worn_tarp_is_a_white(session, wall):
     # Before a white wall, uneven light takes values above the white's.
     assert findings["white-clipped"].level == ("green" if wall < 0.9 else "red")
     # Nothing is clipped that the exposure explains.
-    assert levels({f.name: f for f in check_white(replace(opened, frames=opened.frames[:2]))})[0] == "green"
+    assert found(replace(opened, frames=opened.frames[:2]))["white"].level == "green"
 
 
 def test_a_tarp_beside_the_object_is_a_white(session):
@@ -237,17 +241,10 @@ def test_a_longer_exposure_of_the_frames_is_taken_into_account(session):
     for capture in opened.frames:
         counts = np.rint((capture.cube.read().astype(float) - DARK) * 3.0 + DARK).astype(np.uint16)
         write_cube(capture.cube.header_path, counts, wavelengths_nm=WAVELENGTHS_NM, extra_header={"tint": 30})
-    unknown = {finding.name: finding for finding in check_white(open_session(opened.path))}
-    assert unknown["white-clipped"].level == "red"
-    assert opened.white is not None
-    write_cube(
-        opened.white.cube.header_path,
-        opened.white.cube.read(),
-        wavelengths_nm=WAVELENGTHS_NM,
-        extra_header={"tint": 10},
-    )
-    known = {finding.name: finding for finding in check_white(open_session(opened.path))}
-    assert levels(known) == ("green", "green")
+    assert found(open_session(opened.path))["white-clipped"].level == "red"
+    white = opened.white.cube
+    write_cube(white.header_path, white.read(), wavelengths_nm=WAVELENGTHS_NM, extra_header={"tint": 10})
+    assert levels(found(open_session(opened.path))) == ("green", "green")
 
 
 @pytest.mark.parametrize(
@@ -267,10 +264,10 @@ def test_a_white_of_each_capture(session, spoilt, expected):
         header = capture.cube.header_path
         write_cube(header.with_name(f"WHITEREF_{header.name}"), counts, wavelengths_nm=WAVELENGTHS_NM)
     own = open_session(opened.path)
-    findings = {finding.name: finding for finding in check_white(own, "capture")}
+    findings = found(own, "capture")
     assert findings["white"].level == expected[0]
     assert expected[1] in ("amber", findings["white-clipped"].level)
-    assert levels({finding.name: finding for finding in check_white(own)}) == ("green", "green")
+    assert levels(found(own)) == ("green", "green")
 
 
 def test_a_target_in_the_frames_needs_no_other_white(session):
@@ -280,8 +277,8 @@ def test_a_target_in_the_frames_needs_no_other_white(session):
     for one in (opened, alone):
         assert [finding.level for finding in check_white(one, "target")] == ["green"]
         assert check_dark(one, "target").level == "green"
-    found = calibrate_session(alone, CalibrationConfig(white_source="target", roi=(0, 0, 20, 10)))
-    np.testing.assert_allclose(found.frames[0].gain, 1.0 / (0.6 * LAMP[None]), rtol=1e-3)
+    calibration = calibrate_session(alone, CalibrationConfig(white_source="target", roi=(0, 0, 20, 10)))
+    np.testing.assert_allclose(calibration.frames[0].gain, 1.0 / (0.6 * LAMP[None]), rtol=1e-3)
     with pytest.raises(InputError, match=r"no capture called .*--calibration\.white-source target"):
         check_white(alone)
 

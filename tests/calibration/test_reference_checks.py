@@ -50,11 +50,11 @@ def remove_darks(folder, pattern):
         path.unlink()
 
 
-def test_good_dark_references(folder):
-    assert dark_finding(folder).level == "green"
-    for name in ("ball_1", "ball_2", "ball_3", "ball_4", "white_reference"):
-        write_dark(folder, name)
-    assert dark_finding(folder).level == "green"
+@pytest.mark.parametrize(("light", "level"), [(None, "green"), (0.0, "green"), (0.03, "red")])
+def test_all_dark_references_alike_the_whites_own_too(folder, light, level):
+    for name in () if light is None else ("ball_1", "ball_2", "ball_3", "ball_4", "white_reference"):
+        write_dark(folder, name, light)
+    assert dark_finding(folder).level == level
 
 
 @pytest.mark.parametrize(("light", "level"), [(0.001, "green"), (0.006, "amber"), (0.05, "red"), (0.9, "red")])
@@ -80,12 +80,6 @@ def test_bands_without_data_are_no_light(folder):
         counts[0, 0] = np.nan
         write_cube(header, counts, wavelengths_nm=WAVELENGTHS_NM)
     assert dark_finding(folder).level == "green"
-
-
-def test_all_darks_with_light_the_whites_own_too(folder):
-    for name in ("ball_1", "ball_2", "ball_3", "ball_4", "white_reference"):
-        write_dark(folder, name, 0.03)
-    assert dark_finding(folder).level == "red"
 
 
 def test_one_capture_without_a_dark(folder):

@@ -39,33 +39,22 @@ SPYNDEX = {
     "NDWI": ("NDMI", {"N": 860, "S1": 1240}),
 }
 
-
 # Names of vegspec (Thorp, USDA-ARS), which has the wavelengths of the papers itself.
-VEGSPEC = {
-    "NDVI": "NDVI",
-    "GNDVI": "GNDVI",
+SAME_NAME = ("NDVI", "GNDVI", "MCARI", "MCARI2", "TCARI", "MTCI", "SIPI", "NPCI", "PSRI", "WI", "NDWI")
+VEGSPEC = {name: name for name in SAME_NAME} | {
     "NDVI705": "NDVI3",
     "mND705": "SMNDVI",
     "mSR705": "MSR2",
     "VOG1": "VSR",
-    "MCARI": "MCARI",
-    "MCARI2": "MCARI2",
-    "TCARI": "TCARI",
     "TCARI_OSAVI": "TOR",
-    "MTCI": "MTCI",
     "PSSRa": "PSSRA",
     "PSSRb": "PSSRB",
     "PSSRc": "PSSRC",
-    "SIPI": "SIPI",
-    "NPCI": "NPCI",
     "CRI1": "CRI500",
     "CRI2": "CRI700",
     "ARI1": "ARI",
     "PRI": "PRI3",
-    "PSRI": "PSRI",
-    "WI": "WI",
     "WBI": "PSR",
-    "NDWI": "NDWI",
 }
 
 

@@ -35,17 +35,6 @@ def test_a_white_that_only_its_name_tells_of(tmp_path):
     assert watch.flagged == []
 
 
-def test_a_capture_that_is_being_written_is_waited_for(tmp_path):
-    watch = Watch(tmp_path)
-    write_one(tmp_path, "fruit_0", IMAGE)
-    data = tmp_path / "fruit_0" / "capture" / "fruit_0.raw"
-    whole = data.read_bytes()
-    data.write_bytes(whole[:1000])
-    assert watch.new_lines() == []
-    data.write_bytes(whole)
-    assert len(watch.new_lines()) == 1
-
-
 def test_a_capture_that_stays_incomplete_is_named_when_a_later_one_is_complete(tmp_path):
     watch = Watch(tmp_path)
     for number in range(3):
