@@ -18,7 +18,7 @@ from hsi_sc_nerf.calibration.detector import light_of_some_lines, unlit_bands
 from hsi_sc_nerf.calibration.lamp_drift import NotMeasurable
 from hsi_sc_nerf.calibration.reflectance import PixelCounts
 from hsi_sc_nerf.calibration.session_calibration import SessionCalibration
-from hsi_sc_nerf.calibration.white_reference import bright_region
+from hsi_sc_nerf.calibration.white_reference import Roi, tarp_region
 from hsi_sc_nerf.calibration.white_source import (
     WhiteSource,
     exposure_ratio,
@@ -70,12 +70,15 @@ MAX_SCATTER = 0.02
 """Scatter of the stationary wall from frame to frame that noise and rounding do not explain."""
 
 
-def check_white(session: Session, source: Literal["auto"] | WhiteSource = "auto") -> list[Finding]:
+def check_white(
+    session: Session, source: Literal["auto"] | WhiteSource = "auto", roi: Roi | None = None
+) -> list[Finding]:
     """Check the white of a session on a few lines of each cube.
 
     Args:
         session: its captures.
         source: where the white is. A target in the frames is not checked: the calibration measures it in its place.
+        roi: region of the tarp; None finds it by its brightness.
 
     Returns:
         The findings ``white`` (red if the white is none), ``white-shade`` (amber if a part of a tarp is darker) and
@@ -92,7 +95,7 @@ def check_white(session: Session, source: Literal["auto"] | WhiteSource = "auto"
         return [Finding("white", "green", "The instrument's finished reflectance needs no white.")]
     if found == "target":
         return [Finding("white", "green", "White: a target in every frame, which the calibration measures.")]
-    fault, clipped, values = _check_tarp(session) if found == "tarp" else _check_own_whites(session)
+    fault, clipped, values = _check_tarp(session, roi) if found == "tarp" else _check_own_whites(session)
     white = f"the capture {session.white.name}" if session.white and found == "tarp" else "the white of each capture"
     if fault is None:
         of_white = Finding("white", "green", f"White: {white} looks like a white.", values)
@@ -117,13 +120,13 @@ def check_white(session: Session, source: Literal["auto"] | WhiteSource = "auto"
     return [of_white, Finding("white-shade", "amber", sentence), found_clipped]
 
 
-def _check_tarp(session: Session) -> tuple[str | None, float, dict[str, object]]:
+def _check_tarp(session: Session, roi: Roi | None) -> tuple[str | None, float, dict[str, object]]:
     """What is wrong with the tarp (None for nothing), the fraction of clipped values, and the figures behind it."""
     tarp, frames = session.white, session.frames
     assert tarp is not None
     light = light_of_some_lines(tarp.cube, tarp.dark)
     image = light.mean(axis=-1)
-    region = bright_region(image)
+    region = tarp_region(tarp.cube, image, roi)
     if not region.any():
         return f"the white {tarp.name} is dark; take it again", 0.0, {}
     white = np.median(light[region], axis=0)

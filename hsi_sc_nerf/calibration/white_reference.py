@@ -13,7 +13,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Num
 
 from hsi_sc_nerf import paper
-from hsi_sc_nerf.calibration.detector import Defects, dark_columns, dark_counts, fill_no_data, no_data, unlit_bands
+from hsi_sc_nerf.calibration.detector import (
+    SOME_LINES,
+    Defects,
+    dark_columns,
+    dark_counts,
+    fill_no_data,
+    no_data,
+    spread_rows,
+    unlit_bands,
+)
 from hsi_sc_nerf.capture.envi import Cube
 from hsi_sc_nerf.capture.session import Capture
 from hsi_sc_nerf.errors import InputError
@@ -187,6 +196,18 @@ def tarp_roi(capture: Capture, defects: Defects | None = None) -> Roi:
             f"{cube.header_path}: the tarp has no usable region, because the image is dark; take it again."
         )
     return int(x.min()), int(y.min()), int(x.max()) + 1, int(y.max()) + 1
+
+
+def tarp_region(
+    cube: Cube, brightness: Float[np.ndarray, "rows samples"], roi: Roi | None
+) -> Bool[np.ndarray, "rows samples"]:
+    """Where some lines of a tarp's image (`some_lines`) show it: in a given region, or in the largest bright one."""
+    if roi is not None:
+        rows, columns = spread_rows(cube.shape[0], SOME_LINES), np.arange(cube.shape[1])
+        inside = np.outer((rows >= roi[1]) & (rows < roi[3]), (columns >= roi[0]) & (columns < roi[2]))
+        if inside.any():
+            return inside
+    return bright_region(brightness)
 
 
 def bright_region(brightness: Num[np.ndarray, "lines samples"]) -> Bool[np.ndarray, "lines samples"]:

@@ -15,6 +15,7 @@ from matplotlib import rc_context
 
 from hsi_sc_nerf.calibration.calibration_checks import check_white
 from hsi_sc_nerf.calibration.reference_checks import check_dark, check_lines
+from hsi_sc_nerf.calibration.white_reference import Roi
 from hsi_sc_nerf.calibration.white_source import WhiteSource
 from hsi_sc_nerf.capture.session import Session, open_session
 from hsi_sc_nerf.capture.session_info import SessionInfo
@@ -68,6 +69,7 @@ def inspect_session(
     scale_known: bool = False,
     white_source: Literal["auto"] | WhiteSource = "auto",
     skip_damaged: bool = False,
+    roi: Roi | None = None,
 ) -> Inspection:
     """Check a session before anything is computed from it; a few lines and bands of each cube are read.
 
@@ -77,6 +79,7 @@ def inspect_session(
         scale_known: whether something beside ``session.json`` gives the scale.
         white_source: where the white is.
         skip_damaged: whether the user leaves damaged captures out.
+        roi: region of the white; None finds a tarp by its brightness.
 
     Raises:
         InputError: the session cannot be opened or does not have that source of white, or a cube or the panel
@@ -88,8 +91,8 @@ def inspect_session(
     """
     if not isinstance(session, Session):
         session = open_session(Path(session), skip_damaged=True)
-    of_white = check_white(session, white_source)  # first: it refuses a session without a white
-    quicklooks = quicklooks_of(session)
+    of_white = check_white(session, white_source, roi)  # first: it refuses a session without a white
+    quicklooks = quicklooks_of(session, None if white_source == "target" else roi)
     markers = find_markers(session, quicklooks)
     session, upright = _upright(session, markers, poses)
     suggested = filled_in(session, markers)

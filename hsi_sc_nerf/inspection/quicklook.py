@@ -24,7 +24,7 @@ from hsi_sc_nerf.calibration.detector import (
     spread_rows,
 )
 from hsi_sc_nerf.calibration.reference_checks import bright_pixels
-from hsi_sc_nerf.calibration.white_reference import bright_region
+from hsi_sc_nerf.calibration.white_reference import Roi, tarp_region
 from hsi_sc_nerf.calibration.white_source import exposure_ratio, panel_reflectance
 from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.poses.session_pictures import edge_slope
@@ -79,10 +79,10 @@ class Quicklook:
         return to_8_bit(mean / max(float(np.percentile(mean, MARKERS_PERCENTILE)), 1e-9))
 
 
-def quicklooks_of(session: Session) -> list[Quicklook]:
-    """The quicklooks of a session's frames, in its order."""
+def quicklooks_of(session: Session, roi: Roi | None = None) -> list[Quicklook]:
+    """The quicklooks of a session's frames, in its order; ``roi`` is the region of the tarp, if it is given."""
     with ThreadPoolExecutor(WORKERS) as pool:
-        return list(pool.map(quicklook_of, session.frames, white_levels(session)))
+        return list(pool.map(quicklook_of, session.frames, white_levels(session, roi)))
 
 
 def quicklook_of(capture: Capture, white: Float[np.ndarray, "bands"]) -> Quicklook:
@@ -124,7 +124,7 @@ def quicklook_of(capture: Capture, white: Float[np.ndarray, "bands"]) -> Quicklo
     )
 
 
-def white_levels(session: Session) -> list[Float[np.ndarray, "bands"]]:
+def white_levels(session: Session, roi: Roi | None = None) -> list[Float[np.ndarray, "bands"]]:
     """Counts above dark that are a reflectance of 1 in each frame, by band.
 
     They are those of the tarp at the frame's integration time, over its own reflectance. Without a tarp, or without
@@ -132,14 +132,14 @@ def white_levels(session: Session) -> list[Float[np.ndarray, "bands"]]:
     """
     if session.white is None or not session.has_counts:
         return [white_counts(session.frames[0])] * len(session.frames)
-    level = white_counts(session.white) / panel_reflectance(session)
+    level = white_counts(session.white, roi) / panel_reflectance(session)
     return [level / exposure_ratio(session.white, frame) for frame in session.frames]
 
 
-def white_counts(capture: Capture) -> Float[np.ndarray, "bands"]:
-    """Counts above dark of the largest bright region of a capture, by band: of a tarp in its own."""
+def white_counts(capture: Capture, roi: Roi | None = None) -> Float[np.ndarray, "bands"]:
+    """Counts above dark of a region, or of the largest bright one, of a capture, by band: of a tarp in its own."""
     light = light_of_some_lines(capture.cube, capture.dark)
-    region = bright_region(light.mean(axis=-1))
+    region = tarp_region(capture.cube, light.mean(axis=-1), roi)
     level = np.median(light[region if region.any() else ~region], axis=0)
     return np.maximum(level, 1e-3 * max(float(level.max()), 1e-9))
 

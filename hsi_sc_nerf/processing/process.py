@@ -213,8 +213,9 @@ def _inspect(
 ) -> tuple[Session, SessionChecks]:
     """The session upright, and what its inspection found, whose pictures of all frames are not kept."""
     with console.status("checking the session"):
+        white = config.calibration
         inspection = inspect_session(
-            session, config.poses, scale_known, config.calibration.white_source, config.skip_damaged
+            session, config.poses, scale_known, white.white_source, config.skip_damaged, white.roi
         )
     no_scale = any(finding.name == "scale" and finding.level == "red" for finding in inspection.findings)
     if no_scale and not session.info_path.is_file():

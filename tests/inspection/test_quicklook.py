@@ -60,6 +60,17 @@ def test_a_white_that_fills_little_of_a_dark_chamber(session, side_px, glare_lin
     assert red == []
 
 
+@pytest.mark.parametrize("roi", [None, (30, 30, 90, 90)])
+def test_a_white_before_a_wooden_wall_is_judged_where_it_is_stated_to_be(session, roi):
+    wood = 0.7 * (1.0 + 0.3 * np.random.default_rng(0).uniform(-1.0, 1.0, (128, 128, 1)))
+    white = np.repeat(wood, len(WAVELENGTHS_NM), axis=-1)
+    white[30:90, 30:90] = WHITE
+    write_one(session, "white_reference", white)
+    findings = {finding.name: finding for finding in inspect_session(open_session(session), roi=roi).findings}
+    assert findings["white"].level == ("red" if roi is None else "green")
+    assert findings["paper"].values["reflectance"] == pytest.approx(0.77 if roi else 0.98, rel=0.05)
+
+
 def test_a_panel_whose_reflectance_is_known(session):
     expected = brightness(session)
     write_white(session, 0.4)
