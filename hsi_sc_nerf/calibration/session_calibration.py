@@ -257,10 +257,8 @@ def _kept(session: Session, bad_bands: Bool[np.ndarray, "bands"]) -> Int[np.ndar
 
 def _dark_spectra(captures: Sequence[Capture]) -> list[Float[np.ndarray, "columns bands"]]:
     """Dark counts of each capture; a dark cube of several captures is read once."""
-    read: dict[Cube | None, Float[np.ndarray, "columns bands"]] = {}
-    for capture in captures:
-        if capture.dark not in read:
-            read[capture.dark] = dark_columns(dark_counts(capture.dark), *capture.cube.shape[1:])
+    detector = captures[0].cube.shape[1:]
+    read = {dark: dark_columns(dark_counts(dark), *detector) for dark in {capture.dark for capture in captures}}
     return [read[capture.dark] for capture in captures]
 
 
@@ -270,10 +268,10 @@ def _defects(session: Session, source: WhiteSource, config: CalibrationConfig) -
     lines, samples, _ = captures[0].cube.shape
     numbers = np.unique(np.linspace(0, len(captures) - 1, DEFECT_FRAMES).round().astype(int))
     rows = spread_rows(lines, DEFECT_LINES)
-    of_frames = []
-    for capture in (captures[number] for number in numbers):
-        chosen = np.union1d(rows, _brightest_lines(capture.cube))
-        of_frames.append(_readings(capture.cube, capture.dark, chosen))
+    of_frames = [
+        _readings(capture.cube, capture.dark, np.union1d(rows, _brightest_lines(capture.cube)))
+        for capture in (captures[number] for number in numbers)
+    ]
     good_bands = np.logical_and.reduce([capture.cube.good_bands for capture in captures])
     cube, dark = white_cubes(session, source)
     roi = None if source == "capture" else config.roi
@@ -300,8 +298,7 @@ def _brightest_lines(cube: Cube) -> Int[np.ndarray, "rows"]:
 
 
 def _readings(cube: Cube, dark: Cube | None, rows: Int[np.ndarray, "rows"]) -> Readings:
-    counts = fill_no_data(np.asarray(cube.memmap()[rows]), cube.ignore_value)
-    return Readings(counts, dark_counts(dark))
+    return Readings(fill_no_data(np.asarray(cube.memmap()[rows]), cube.ignore_value), dark_counts(dark))
 
 
 def _noise(session: Session, source: WhiteSource, white: White, defects: Defects) -> NoiseModel:

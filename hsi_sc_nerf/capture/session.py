@@ -144,11 +144,6 @@ class Session:
         return self.path / SESSION_INFO_NAME
 
     @property
-    def band_centres_path(self) -> Path | None:
-        """The CSV of band centres that ``session.json`` names."""
-        return None if self.info.band_centres is None else self.path / self.info.band_centres
-
-    @property
     def panel_reflectance_path(self) -> Path | None:
         """The CSV of the white's own reflectance that ``session.json`` names."""
         return None if self.info.panel_reflectance is None else self.path / self.info.panel_reflectance

@@ -117,19 +117,18 @@ def _upright(session: Session, markers: Markers, poses: PoseMethod) -> tuple[Ses
     Markers tell which way is up, whatever is stated. Other poses take it from the images: upside down, they would set
     the object on its head.
     """
-    measured = markers.rotation_deg
-    values = {"stated_deg": session.info.image_rotation_deg, "measured_deg": measured}
-    assumed = session.image_rotation_deg
+    measured, stated = markers.rotation_deg, session.info.image_rotation_deg
+    values = {"stated_deg": stated, "measured_deg": measured}
     if measured is None:
-        source = "session.json" if session.info.image_rotation_deg is not None else "the instrument's default"
-        sentence = f"Upright: images are rotated by {assumed} degrees, according to {source}."
+        source = "session.json" if stated is not None else "the instrument's default"
+        sentence = f"Upright: images are rotated by {session.image_rotation_deg} degrees, according to {source}."
         return session, Finding("upright", "green", sentence, values)
-    if session.info.image_rotation_deg is not None and measured != assumed:
+    if stated is not None and stated != measured:
         sentence = (
-            f"{session.info_path}: states image_rotation_deg {assumed}, but by the markers it is {measured}; correct "
+            f"{session.info_path}: states image_rotation_deg {stated}, but by the markers it is {measured}; correct "
             "it, or leave it out."
         )
-        is_spoilt = poses in ("colmap", "angles") and abs(measured - assumed) == 180
+        is_spoilt = poses in ("colmap", "angles") and (measured - stated) % 360 == 180
         return session, Finding("upright", "red" if is_spoilt else "amber", sentence, values)
     sentence = f"Upright: images are rotated by {measured} degrees, as the markers show."
     return replace(session, image_rotation_deg=measured), Finding("upright", "green", sentence, values)

@@ -28,6 +28,7 @@ from hsi_sc_nerf.calibration.reflectance import FrameCalibration, PictureBands, 
 from hsi_sc_nerf.calibration.session_calibration import SessionCalibration
 from hsi_sc_nerf.capture.envi import Cube, CubeLines, open_cube
 from hsi_sc_nerf.capture.session import Capture, Session
+from hsi_sc_nerf.capture.session_info import SESSION_INFO_NAME
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write, write_png
 from hsi_sc_nerf.packed.cube import write_packed_cube
@@ -277,8 +278,9 @@ def session_files(session: Session) -> list[list[tuple[str, int, int]]]:
 
     These are ``session.json``, the files it names, and the tarp.
     """
-    paths = [session.info_path, session.band_centres_path, session.panel_reflectance_path]
-    shared = _stamps(session.path, [path for path in paths if path is not None and path.is_file()])
+    names = (SESSION_INFO_NAME, session.info.band_centres, session.info.panel_reflectance)
+    paths = [session.path / name for name in names if name is not None]
+    shared = _stamps(session.path, [path for path in paths if path.is_file()])
     if session.white is not None:
         shared += capture_files(session, session.white)
     return [shared, *(capture_files(session, frame) for frame in session.frames)]
