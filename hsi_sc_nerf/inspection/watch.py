@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hsi_sc_nerf.calibration.detector import DIGITISER_LIMITS
-from hsi_sc_nerf.capture.instrument import CaptureFiles, list_captures
+from hsi_sc_nerf.capture.instrument import list_captures
 from hsi_sc_nerf.capture.roles import white_name
 from hsi_sc_nerf.capture.session import Capture, open_captures
 from hsi_sc_nerf.capture.session_info import SESSION_INFO_NAME, SessionInfo, read_session_info
@@ -56,20 +56,20 @@ class Watch:
         try:
             self._info = read_session_info(self.path / SESSION_INFO_NAME)
             found = list_captures(self.path).captures
+            unseen = [files for files in found if files.name not in self._seen]
+            opened = {c.name: c for c in open_captures(unseen, self._info, self.path, self.incomplete)}
         except (InputError, OSError) as error:
             self.incomplete = waited_for
             return self._once(str(error))
         white = white_name(self._info, [files.name for files in found]).lower()
-        for files in (files for files in found if files.name not in self._seen):
-            opened = open_captures([files], self._info, self.path, self.incomplete)
-            if not opened:
-                continue
-            if not self._is_complete(files):
+        for files in (files for files in unseen if files.name in opened):
+            # A SPECIM IQ writes it beside the counts.
+            if self._first is not None and self._first.dark is not None and "dark" not in files.headers:
                 self.incomplete[files.name] = "its dark cube is missing"
                 continue
             self._seen.add(files.name)
             self.captures += 1
-            lines.append(self._line(opened[0], files.name.lower() == white))
+            lines.append(self._line(opened[files.name], files.name.lower() == white))
         for name in self.incomplete if lines else ():
             if name in waited_for:
                 lines += self._once(f"{name}: NOT COMPLETE, {self.incomplete[name]}")
@@ -80,10 +80,6 @@ class Watch:
         reported = line in self._reported
         self._reported.add(line)
         return [] if reported else [line]
-
-    def _is_complete(self, files: CaptureFiles) -> bool:
-        """Whether the dark cube, which a SPECIM IQ writes beside the counts, is there if earlier captures had one."""
-        return self._first is None or self._first.dark is None or "dark" in files.headers
 
     def _line(self, capture: Capture, is_white: bool) -> str:
         quicklook = quicklook_of(capture, white_counts(capture))

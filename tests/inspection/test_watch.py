@@ -73,6 +73,15 @@ def test_a_session_json_that_cannot_be_used_is_told_once_and_the_watch_goes_on(t
     assert line.startswith("fruit_0:")
 
 
+def test_a_table_that_is_being_edited_does_not_end_the_watch(tmp_path):
+    watch = Watch(tmp_path)
+    (tmp_path / "session.json").write_text('{"band_centres": "bands.csv"}')
+    (tmp_path / "bands.csv").write_text("wavelength_nm\n")
+    write_one(tmp_path, "fruit_0", IMAGE)
+    (told,) = watch.new_lines()
+    assert "bands.csv: its band centres are not wavelengths" in told
+
+
 @pytest.mark.slow
 def test_what_is_wrong_is_flagged_at_once(tmp_path):
     watch = Watch(tmp_path)
