@@ -43,6 +43,7 @@ class Watch:
         self._reported: set[str] = set()
         self._info = SessionInfo()
         self._first: Capture | None = None
+        self._with_dark = False
         self._dictionary: str | None = None
 
     def new_lines(self) -> list[str]:
@@ -62,9 +63,10 @@ class Watch:
             self.incomplete = waited_for
             return self._once(str(error))
         white = white_name(self._info, [files.name for files in found]).lower()
+        # A SPECIM IQ writes it beside the counts.
+        self._with_dark = self._with_dark or any(capture.dark is not None for capture in opened.values())
         for files in (files for files in unseen if files.name in opened):
-            # A SPECIM IQ writes it beside the counts.
-            if self._first is not None and self._first.dark is not None and "dark" not in files.headers:
+            if self._with_dark and opened[files.name].has_counts and opened[files.name].dark is None:
                 self.incomplete[files.name] = "its dark cube is missing"
                 continue
             self._seen.add(files.name)

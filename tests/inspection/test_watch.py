@@ -35,6 +35,19 @@ def test_a_white_that_only_its_name_tells_of(tmp_path):
     assert watch.flagged == []
 
 
+def test_the_first_frame_waits_for_its_dark_cube_if_the_white_had_one(tmp_path):
+    watch = Watch(tmp_path)
+    write_one(tmp_path, "white_reference", np.full(IMAGE.shape, 0.98))
+    write_one(tmp_path, "fruit_0", IMAGE)
+    dark = tmp_path / "fruit_0" / "capture" / "DARKREF_fruit_0.hdr"
+    text = dark.read_text()
+    dark.unlink()
+    watch.new_lines()
+    assert watch.incomplete == {"fruit_0": "its dark cube is missing"}
+    dark.write_text(text)
+    assert [line.split(":")[0] for line in watch.new_lines()] == ["fruit_0"]
+
+
 def test_a_capture_that_stays_incomplete_is_named_when_a_later_one_is_complete(tmp_path):
     watch = Watch(tmp_path)
     for number in range(3):
