@@ -241,7 +241,7 @@ def _drift(
         noise,
         session.wavelengths_nm,
         saturation_counts=None if defects.saturation_counts is None else defects.saturation_counts / max(exposures),
-        dead=defects.dead,
+        dead=defects.dead | defects.bad_bands,
     )
 
 

@@ -258,6 +258,21 @@ def test_the_uncertainty_is_that_of_the_shortest_exposure_whichever_frame_it_is(
     np.testing.assert_allclose(found.linear, 4.0 * usual.linear)
 
 
+def test_bands_that_are_listed_as_bad_do_not_hide_the_drift_of_the_others(tmp_path):
+    effects = ["{lamp_drift: {percent: -6}}", "photon_noise", "read_noise"]
+    scene = override(load_scene("sphere"), size_px=48, bands=12, frames=4, effects=effects)
+    session = open_session(simulate_session(scene, tmp_path / "session", progress=False))
+    whole = calibrate_session(session, CalibrationConfig()).drift
+    rng, listed = np.random.default_rng(0), np.arange(12) % 4 != 1
+    for cube in (cube for capture in session.captures for cube in capture.cubes):
+        counts = np.where(listed, cube.read(), rng.integers(100, 4000, cube.shape, np.uint16))
+        rewrite(cube, counts, bbl=listed.astype(int).tolist())
+    found = calibrate_session(open_session(session.path), CalibrationConfig())
+    assert found.bands.tolist() == np.flatnonzero(listed).tolist()
+    assert found.drift_corrected
+    np.testing.assert_allclose(found.drift.factor[:, listed], whole.factor[:, listed], atol=2e-3)
+
+
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_a_band_without_data_leaves_the_uncertainty_of_the_others(tmp_path):
     scene = override(load_scene("sphere"), size_px=48, bands=12, frames=3, effects=["photon_noise", "read_noise"])
