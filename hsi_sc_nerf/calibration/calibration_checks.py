@@ -125,7 +125,7 @@ def _check_tarp(session: Session, roi: Roi | None) -> tuple[str | None, float, d
     tarp, frames = session.white, session.frames
     assert tarp is not None
     light = light_of_some_lines(tarp.cube, tarp.dark)
-    image = light.mean(axis=-1)
+    image = light[..., tarp.cube.good_bands].mean(axis=-1)
     region = tarp_region(tarp.cube, image, roi)
     if not region.any():
         return f"the white {tarp.name} is dark; take it again", 0.0, {}
@@ -222,7 +222,9 @@ def _check_own_whites(session: Session) -> tuple[str | None, float, dict[str, ob
         if len(columns) != frame.cube.shape[1]:
             columns = np.median(columns, axis=0, keepdims=True)
         whites.append(columns / of_panel / white_exposure_ratio(session, "capture", frame))
-        low, middle, high = np.percentile(light.mean(axis=-1), [10.0, 50.0, 90.0], axis=0)
+        low, middle, high = np.percentile(
+            light[..., frame.white.good_bands].mean(axis=-1), [10.0, 50.0, 90.0], axis=0
+        )
         uneven[frame.name] = float(np.median((high - low) / np.maximum(middle, 1e-9)))
         good_bands &= frame.cube.good_bands
     lit = ~unlit_bands(np.stack([np.median(white, axis=0) for white in whites]))

@@ -75,8 +75,9 @@ def check_dark(
         advice = f" or leave out with {leave_out(frames)}" if 0 < len(frames) < len(session.frames) else ""
         return Finding("dark", "red", f"{sentence}{advice}.", {"without": without})
     # With a target, this is the brightest part of the first frame.
-    white = np.percentile(some_lines(white_cubes(session, found)[0]), 95.0, axis=(0, 1))
-    with_data, lit, other = ~unlit_bands(white[None]), {}, []
+    of_white = white_cubes(session, found)[0]
+    white = np.percentile(some_lines(of_white), 95.0, axis=(0, 1))
+    with_data, lit, other = ~unlit_bands(white[None]) & of_white.good_bands, {}, []
     for name, _, counts_ms, cube in exposures:
         assert cube is not None
         dark = (spectra or {}).get(name)

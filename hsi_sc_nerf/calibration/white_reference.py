@@ -183,7 +183,7 @@ def tarp_roi(capture: Capture, defects: Defects | None = None) -> Roi:
         InputError: the image is dark.
     """
     cube = capture.cube
-    live = ~dead_elements(defects, *cube.shape[1:])
+    live = ~dead_elements(defects, *cube.shape[1:]) & cube.good_bands
     brightness = []
     for line in cube.memmap():
         missing = no_data(line, cube.ignore_value)
@@ -309,10 +309,10 @@ def mean_over_columns(spectra: Float[np.ndarray, "columns bands"]) -> Float[np.n
 
 
 def dead_elements(defects: Defects | None, samples: int, bands: int) -> Bool[np.ndarray, "samples bands"]:
-    """The dead elements; none if the defects are unknown or of another detector."""
+    """The dead elements and those of bad bands; none if the defects are unknown or of another detector."""
     if defects is None or defects.dead.shape != (samples, bands):
         return np.zeros((samples, bands), bool)
-    return defects.dead
+    return defects.dead | defects.bad_bands
 
 
 def _bad_bands(

@@ -33,8 +33,6 @@ from hsi_sc_nerf.spectra import nearest_bands, to_8_bit
 
 PICTURE_NM = (640.0, 550.0, 470.0)
 """Red, green and blue of the pictures; markers' inks are dark in all of them."""
-NEIGHBOURS = 2
-"""Number of neighbouring bands averaged into a channel of a picture; they lie side by side in the file."""
 DARK_SIGMAS = 3.0
 """A value is dark if it exceeds the dark cube by less than this many standard deviations."""
 MARKERS_PERCENTILE = 99.5
@@ -50,7 +48,7 @@ class Quicklook:
     Attributes:
         name: name of the capture.
         picture: pseudo-RGB reflectance; without a white, relative to its largest bright region.
-        top_counts: the largest reading of the lines read.
+        top_counts: the largest reading of the lines read, without bands that are marked as bad.
         at_top_fraction: fraction of the readings with ``top_counts``, by band.
         dark_fraction: fraction of the readings without light, by band.
         sharpness_per_px: mean slope of the strongest edges over the picture's contrast.
@@ -96,11 +94,13 @@ def quicklook_of(capture: Capture, white: Float[np.ndarray, "bands"]) -> Quicklo
     lines = np.asarray(counts[spread_rows(cube.shape[0], SOME_LINES)])
     dark = None if capture.dark is None else some_lines(capture.dark)
     read, light = fill_no_data(lines, cube.ignore_value), light_above(lines, dark, cube.ignore_value)
-    channels, noise = nearest_bands(cube.wavelengths_nm, PICTURE_NM), np.zeros(cube.shape[2])
+    good, noise = cube.good_bands, np.zeros(cube.shape[2])
+    channels = nearest_bands(np.where(good, cube.wavelengths_nm, np.inf), PICTURE_NM).tolist()
     if dark is not None:
         noise = _noise_above(np.asarray(dark, np.float32))
     level = dark_columns(dark, *cube.shape[1:]).mean(axis=0)
-    bands = [slice(max(0, band - NEIGHBOURS // 2), max(0, band - NEIGHBOURS // 2) + NEIGHBOURS) for band in channels]
+    # With the band before, which lies beside it in the file.
+    bands = [slice(band - int(band > 0 and good[band - 1]), band + 1) for band in channels]
     picture = np.stack(
         [
             (_mean_counts(counts[..., near], cube.ignore_value, level[near].mean()) - level[near].mean())
@@ -110,7 +110,7 @@ def quicklook_of(capture: Capture, white: Float[np.ndarray, "bands"]) -> Quicklo
         axis=-1,
         dtype=np.float32,
     )
-    top = read.max()
+    top = read[..., good].max()
     return Quicklook(
         name=capture.name,
         picture=picture,
@@ -139,7 +139,7 @@ def white_levels(session: Session, roi: Roi | None = None) -> list[Float[np.ndar
 def white_counts(capture: Capture, roi: Roi | None = None) -> Float[np.ndarray, "bands"]:
     """Counts above dark of a region, or of the largest bright one, of a capture, by band: of a tarp in its own."""
     light = light_of_some_lines(capture.cube, capture.dark)
-    region = tarp_region(capture.cube, light.mean(axis=-1), roi)
+    region = tarp_region(capture.cube, light[..., capture.cube.good_bands].mean(axis=-1), roi)
     level = np.median(light[region if region.any() else ~region], axis=0)
     return np.maximum(level, 1e-3 * max(float(level.max()), 1e-9))
 
@@ -161,7 +161,7 @@ def saturation_level(session: Session, quicklooks: Sequence[Quicklook]) -> float
     """Reading at which the frames saturate, by the brightest of them; None if nothing saturates."""
     brightest = sorted(range(len(quicklooks)), key=lambda index: -quicklooks[index].top_counts)[:3]
     cubes = [some_lines(session.frames[index].cube) for index in brightest]
-    return saturation_counts(cubes, np.ones(cubes[0].shape[1:], bool))
+    return saturation_counts(cubes, np.broadcast_to(session.frames[0].cube.good_bands, cubes[0].shape[1:]))
 
 
 def sharpness_per_px(picture: Float[np.ndarray, "lines samples"]) -> float:

@@ -20,6 +20,7 @@ from inspection_session import (
     write_turntable,
 )
 
+from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, calibrate_session
 from hsi_sc_nerf.capture.envi import open_cube, write_cube
 from hsi_sc_nerf.capture.session import Session, open_session
 from hsi_sc_nerf.capture.session_info import SessionInfo
@@ -145,6 +146,26 @@ def test_cubes_with_values_that_are_no_data(session, tmp_path, lost):
         assert "fruit_04" in findings["exposure"].sentence
     else:
         assert findings["turn"].level == "green"
+
+
+@pytest.mark.parametrize("bad", [4, 7])
+def test_a_band_that_is_marked_as_bad_may_hold_anything(session, bad):
+    """Here the tarp fills a part of its image only, and pictures show the one band and not the other."""
+    rng, listed = np.random.default_rng(0), np.arange(9) != bad
+    white = np.full((SIZE_PX, SIZE_PX, len(listed)), 0.1)
+    white[:, 40:] = 0.98
+    write_one(session, "white_reference", white)
+    for header in session.glob("*/capture/*.hdr"):
+        cube = open_cube(header)
+        counts = cube.read()
+        counts[..., bad] = rng.integers(60_000, 65_535, counts.shape[:2])
+        fields = {"tint": 10, "bbl": listed.astype(int).tolist()}
+        write_cube(header, counts, wavelengths_nm=cube.wavelengths_nm, extra_header=fields)
+    assert found(session, "red") == {}
+    assert found(session, "amber") == {}
+    calibration = calibrate_session(open_session(session), CalibrationConfig())
+    assert calibration.white.roi == (40, 0, SIZE_PX, SIZE_PX)
+    np.testing.assert_allclose(calibration.white.measured[0, listed], 0.98 * LAMP[listed], rtol=5e-3)
 
 
 def test_damaged_captures_are_named(session):
