@@ -19,13 +19,7 @@ from hsi_sc_nerf.calibration.lamp_drift import NotMeasurable
 from hsi_sc_nerf.calibration.reflectance import PixelCounts
 from hsi_sc_nerf.calibration.session_calibration import SessionCalibration
 from hsi_sc_nerf.calibration.white_reference import Roi, tarp_region
-from hsi_sc_nerf.calibration.white_source import (
-    WhiteSource,
-    exposure_ratio,
-    panel_reflectance,
-    white_exposure_ratio,
-    white_source,
-)
+from hsi_sc_nerf.calibration.white_source import WhiteSource, panel_reflectance, white_exposure_ratio, white_source
 from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.findings import Finding, Level
 
@@ -97,9 +91,8 @@ def check_white(
         return [Finding("white", "green", "White: a target in every frame, which the calibration measures.")]
     fault, clipped, values = _check_tarp(session, roi) if found == "tarp" else _check_own_whites(session)
     white = f"the capture {session.white.name}" if session.white and found == "tarp" else "the white of each capture"
-    if fault is None:
-        of_white = Finding("white", "green", f"White: {white} looks like a white.", values)
-    else:
+    of_white = Finding("white", "green", f"White: {white} looks like a white.", values)
+    if fault is not None:
         of_white = Finding("white", "red", f"{session.path}: {fault}.", values)
     level: Level = "red" if clipped > ABOVE_RED else "amber" if clipped > ABOVE_AMBER else "green"
     described = session.panel_reflectance_path is not None
@@ -132,7 +125,7 @@ def _check_tarp(session: Session, roi: Roi | None) -> tuple[str | None, float, d
     white = np.median(light[region], axis=0)
     perfect = white / panel_reflectance(session)
     live = ~unlit_bands(white[None]) & tarp.cube.good_bands
-    exposures = np.array([exposure_ratio(tarp, frame) for frame in frames])
+    exposures = np.array([white_exposure_ratio(session, "tarp", frame) for frame in frames])
     images, clipped, outshone = _compare_with_white(frames, [perfect[None] / ratio for ratio in exposures], live)
     differences = np.abs(np.diff(image, axis=1)) / np.maximum(image[:, 1:], 1e-9)
     two_levels = is_partly_shaded(image, region)
@@ -222,9 +215,8 @@ def _check_own_whites(session: Session) -> tuple[str | None, float, dict[str, ob
         if len(columns) != frame.cube.shape[1]:
             columns = np.median(columns, axis=0, keepdims=True)
         whites.append(columns / of_panel / white_exposure_ratio(session, "capture", frame))
-        low, middle, high = np.percentile(
-            light[..., frame.white.good_bands].mean(axis=-1), [10.0, 50.0, 90.0], axis=0
-        )
+        image = light[..., frame.white.good_bands].mean(axis=-1)
+        low, middle, high = np.percentile(image, [10.0, 50.0, 90.0], axis=0)
         uneven[frame.name] = float(np.median((high - low) / np.maximum(middle, 1e-9)))
         good_bands &= frame.cube.good_bands
     lit = ~unlit_bands(np.stack([np.median(white, axis=0) for white in whites]))

@@ -146,8 +146,8 @@ def check_lines(
         f"a lamp with narrow lines, such as a room's lamp or a screen, shone on {lit_alone} only; switch it off and "
         "take them again"
     )
-    limits = LINE_AMBER, LINE_RED
-    return [judged("light-lines", float(np.abs(height[worst])), limits, f"{session.path}: {text}", advice)]
+    value = float(np.abs(height[worst]))
+    return [judged("light-lines", value, (LINE_AMBER, LINE_RED), f"{session.path}: {text}", advice)]
 
 
 def _exposures(session: Session, source: WhiteSource) -> list[tuple[str, Cube, float | None, Cube | None]]:

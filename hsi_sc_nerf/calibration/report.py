@@ -122,17 +122,16 @@ def draw_white_reference(path: Path, cube: Cube, white: WhiteReference, rgb_nm: 
     counts = fill_no_data(cube.memmap()[..., bands], cube.ignore_value).astype(float)
     image = to_8_bit(counts / np.maximum(np.percentile(counts, 95.0, axis=(0, 1)), 1e-9))
     figure = new_figure(12.0, 10.0)
-    # A letter for each panel, six columns wide.
-    panels = {"i": "image", "d": "deviation", "l": "lower", "u": "used", "h": "higher", "s": "spectrum"}
-    mosaic = figure.subplot_mosaic("iiiddd;lluuhh;ssssss", height_ratios=[4.0, 4.0, 3.0])
-    axes = {panel: mosaic[letter] for letter, panel in panels.items()}
+    top, middle = ["image"] * 3 + ["deviation"] * 3, ["lower"] * 2 + ["used"] * 2 + ["higher"] * 2
+    rows: list[Any] = [top, middle, ["spectrum"] * 6]
+    axes = figure.subplot_mosaic(rows, height_ratios=[4.0, 4.0, 3.0])
     axes["image"].imshow(draw_outline(image, white.region(image.shape[:2])))
     region = Rectangle((x0 - 0.5, y0 - 0.5), x1 - x0, y1 - y0, fill=False, edgecolor=COLOURS[1], linewidth=2)
     axes["image"].add_patch(region)
     axes["image"].set_title(f"White: coarse region, and the {white.pixels} pixels that are kept")
     extent = (x0 - 0.5, x1 - 0.5, y1 - 0.5, y0 - 0.5)
-    top = np.percentile(white.deviation, 99.0)
-    shown = axes["deviation"].imshow(white.deviation, cmap="viridis", extent=extent, vmin=0.0, vmax=top)
+    largest = np.percentile(white.deviation, 99.0)
+    shown = axes["deviation"].imshow(white.deviation, cmap="viridis", extent=extent, vmin=0.0, vmax=largest)
     figure.colorbar(shown, ax=axes["deviation"], extend="max", shrink=0.8)
     axes["deviation"].set_title(f"Deviation D from the mean, median {np.median(white.deviation):.4f}")
     for name, step in {"lower": -PERCENTILE_STEP, "used": 0.0, "higher": PERCENTILE_STEP}.items():
@@ -143,8 +142,8 @@ def draw_white_reference(path: Path, cube: Cube, white: WhiteReference, rgb_nm: 
         mean = f"{white.deviation[mask].mean():.4f}" if mask.any() else "-"
         kept_percent = 100.0 * mask.mean()
         axes[name].set_title(f"{percentile:g}th percentile keeps {kept_percent:.1f} %,\nmean D {mean}")
-    for name in panels.values():
-        axes[name].grid(name == "spectrum")
+    for name, panel in axes.items():
+        panel.grid(name == "spectrum")
     _draw_spectrum(axes["spectrum"], white, cube.wavelengths_nm)
     save_figure(figure, path)
 

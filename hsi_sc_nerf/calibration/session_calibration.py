@@ -224,7 +224,7 @@ def _drift(
     if len(lines) == 1 and 0 not in lines:
         darks = pooled_darks(darks, lines.pop(), noise.read_noise)
     survey = survey_lines(*captures[0].cube.shape[:2])
-    exposures = [exposure_ratio(capture, captures[0]) for capture in captures]
+    exposures = [exposure_ratio(c.integration_time_ms, captures[0].integration_time_ms) for c in captures]
 
     def read_lines(frame: int) -> Num[np.ndarray, "survey samples bands"]:
         cube = captures[frame].cube

@@ -103,21 +103,19 @@ def has_one_white(session: Session, source: WhiteSource) -> bool:
     return len(copies_of_others([first], {str(path): path for path in others})) == len(others)
 
 
-def exposure_ratio(capture: Capture, other: Capture) -> float:
-    """Ratio of two captures' integration times; 1 if one is unknown."""
-    return _ratio(capture.integration_time_ms, other.integration_time_ms)
+def exposure_ratio(one_ms: float | None, other_ms: float | None) -> float:
+    """Ratio of two integration times; 1 if one is unknown."""
+    return 1.0 if one_ms is None or other_ms is None else one_ms / other_ms
 
 
 def white_exposure_ratio(session: Session, source: WhiteSource, capture: Capture) -> float:
     """Ratio of the white's integration time to the sample's; 1 if one is unknown."""
     if source == "tarp":
         assert session.white is not None
-        return exposure_ratio(session.white, capture)
-    return 1.0 if source == "target" else _ratio(capture.white_integration_time_ms, capture.integration_time_ms)
-
-
-def _ratio(one_ms: float | None, other_ms: float | None) -> float:
-    return 1.0 if one_ms is None or other_ms is None else one_ms / other_ms
+        return exposure_ratio(session.white.integration_time_ms, capture.integration_time_ms)
+    if source == "target":
+        return 1.0
+    return exposure_ratio(capture.white_integration_time_ms, capture.integration_time_ms)
 
 
 def panel_reflectance(session: Session) -> Float[np.ndarray, "bands"]:

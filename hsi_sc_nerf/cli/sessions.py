@@ -179,7 +179,7 @@ class InspectCommand:
         except KeyboardInterrupt:
             flagged = f"look at {', '.join(watch.flagged)}" if watch.flagged else "nothing is wrong with them"
             waiting = f"; not complete: {', '.join(watch.incomplete)}" if watch.incomplete else ""
-            console.print(f"{watch.captures} captures; {flagged}{waiting}.", highlight=False, markup=False)
+            console.print(f"{len(watch.captures)} captures; {flagged}{waiting}.", highlight=False, markup=False)
 
 
 def show_findings(console: Console, inspection: Inspection) -> None:

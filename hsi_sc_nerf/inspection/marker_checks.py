@@ -128,16 +128,14 @@ def _seen_in_mirror(
 
 def check_markers(session: Session, markers: Markers) -> list[Finding]:
     """The findings ``markers``, ``mirrored``, ``turn`` and ``expected-accuracy``."""
-    mirrored = [_mirrored(session)] if markers.mirrored else []
-    return [_seen(session, markers), *mirrored, _turn(session, markers), _expected(session, markers)]
-
-
-def _mirrored(session: Session) -> Finding:
-    sentence = (
-        f"{session.path}: the images are mirrored: their markers can be read only in a mirror, and the model would "
-        "be the object's mirror image; export the cubes without flipping their lines or samples."
-    )
-    return Finding("mirrored", "red", sentence)
+    findings = [_seen(session, markers), _turn(session, markers), _expected(session, markers)]
+    if markers.mirrored:
+        sentence = (
+            f"{session.path}: the images are mirrored: their markers can be read only in a mirror, and the model "
+            "would be the object's mirror image; export the cubes without flipping their lines or samples."
+        )
+        findings.insert(1, Finding("mirrored", "red", sentence))
+    return findings
 
 
 def _seen(session: Session, markers: Markers) -> Finding:

@@ -25,7 +25,7 @@ from hsi_sc_nerf.calibration.detector import (
 )
 from hsi_sc_nerf.calibration.reference_checks import bright_pixels
 from hsi_sc_nerf.calibration.white_reference import Roi, tarp_region
-from hsi_sc_nerf.calibration.white_source import exposure_ratio, panel_reflectance
+from hsi_sc_nerf.calibration.white_source import panel_reflectance, white_exposure_ratio
 from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.poses.session_pictures import edge_slope
 from hsi_sc_nerf.robust_scatter import robust_std
@@ -133,7 +133,7 @@ def white_levels(session: Session, roi: Roi | None = None) -> list[Float[np.ndar
     if session.white is None or not session.has_counts:
         return [white_counts(session.frames[0])] * len(session.frames)
     level = white_counts(session.white, roi) / panel_reflectance(session)
-    return [level / exposure_ratio(session.white, frame) for frame in session.frames]
+    return [level / white_exposure_ratio(session, "tarp", frame) for frame in session.frames]
 
 
 def white_counts(capture: Capture, roi: Roi | None = None) -> Float[np.ndarray, "bands"]:

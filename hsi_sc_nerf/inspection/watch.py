@@ -27,17 +27,16 @@ class Watch:
         path: the session's folder; it may be empty.
 
     Attributes:
-        captures: number of captures that were reported.
+        captures: names of the captures that were reported.
         flagged: names of those with a fault.
         incomplete: why other captures cannot be read, by name.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.captures = 0
+        self.captures: set[str] = set()
         self.flagged: list[str] = []
         self.incomplete: dict[str, str] = {}
-        self._seen: set[str] = set()
         self._quicklooks: list[Quicklook] = []
         self._markers: list[int] = []
         self._reported: set[str] = set()
@@ -57,7 +56,7 @@ class Watch:
         try:
             self._info = read_session_info(self.path / SESSION_INFO_NAME)
             found = list_captures(self.path).captures
-            unseen = [files for files in found if files.name not in self._seen]
+            unseen = [files for files in found if files.name not in self.captures]
             opened = {c.name: c for c in open_captures(unseen, self._info, self.path, self.incomplete)}
         except (InputError, OSError) as error:
             self.incomplete = waited_for
@@ -69,8 +68,7 @@ class Watch:
             if self._with_dark and opened[files.name].has_counts and opened[files.name].dark is None:
                 self.incomplete[files.name] = "its dark cube is missing"
                 continue
-            self._seen.add(files.name)
-            self.captures += 1
+            self.captures.add(files.name)
             lines.append(self._line(opened[files.name], files.name.lower() == white))
         for name in self.incomplete if lines else ():
             if name in waited_for:

@@ -12,7 +12,6 @@ BANDS, FRAMES = 24, 20
 WAVELENGTHS_NM = np.linspace(400.0, 1000.0, BANDS)
 MANY_NM = np.linspace(400.0, 1000.0, 120)
 
-
 COURSES = {
     "ramp": np.linspace(-1.0, 1.0, FRAMES),
     "warm-up": 2.0 * np.exp(-np.arange(FRAMES) / 4.0),

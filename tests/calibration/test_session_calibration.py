@@ -30,6 +30,7 @@ ODDITIES = [
     "image_rotation",
 ]
 NOISE = ["photon_noise", "read_noise", "dark_pattern"]
+DRIFTING = ["{lamp_drift: {percent: -6}}", "photon_noise", "read_noise"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,9 +46,14 @@ class Calibrated:
         return score_calibration(self.session, self.calibration, self.root, self.truth)
 
 
+def simulated(folder: Path, name: str = "sphere", **changes) -> Session:
+    """A simulated session: a small one of three frames and twelve bands, if nothing else is said."""
+    scene = override(load_scene(name), **{"size_px": 48, "bands": 12, "frames": 3, "effects": [], **changes})
+    return open_session(simulate_session(scene, folder / "session", progress=False))
+
+
 def calibrated(folder: Path, effects: list[str], config: CalibrationConfig) -> Calibrated:
-    scene = override(load_scene("pear"), size_px=72, bands=40, frames=6, effects=effects)
-    session = open_session(simulate_session(scene, folder / "session", progress=False))
+    session = simulated(folder, "pear", size_px=72, bands=40, frames=6, effects=effects)
     calibration = calibrate_session(session, config)
     pack_frames(session, calibration, folder / "data")
     return Calibrated(session, load_truth(session.path), calibration, folder / "data")
@@ -123,8 +129,7 @@ def rewrite(cube: Cube, counts: np.ndarray, **fields) -> None:
 )
 def test_no_data_is_taken_neither_for_light_nor_for_darkness(tmp_path, gap, dtype, saturation):
     effects = ["{lamp_drift: {percent: -6}}", *saturation, *NOISE]
-    scene = override(load_scene("pear"), size_px=72, bands=24, frames=6, effects=effects)
-    session = open_session(simulate_session(scene, tmp_path / "session", progress=False))
+    session = simulated(tmp_path, "pear", size_px=72, bands=24, frames=6, effects=effects)
     whole = calibrate_session(session, CalibrationConfig())
     for capture in session.captures:
         leave_gaps(capture.cube, gap, dtype)
@@ -144,8 +149,7 @@ def test_no_data_is_taken_neither_for_light_nor_for_darkness(tmp_path, gap, dtyp
 @pytest.mark.slow
 @pytest.mark.parametrize("white_lines", [None, 2])
 def test_a_dark_of_one_line_states_the_uncertainty_of_many_or_none(tmp_path, white_lines):
-    scene = override(load_scene("pear"), size_px=72, bands=24, frames=3, effects=NOISE)
-    session = open_session(simulate_session(scene, tmp_path / "session", progress=False))
+    session = simulated(tmp_path, "pear", size_px=72, bands=24, effects=NOISE)
     whole = calibrate_session(session, CalibrationConfig())
     for dark in {capture.dark for capture in session.captures}:
         rewrite(dark, dark.read()[:1])
@@ -181,15 +185,13 @@ def test_hot_elements_do_not_move_the_tarp(tmp_path):
 
 def test_a_small_saturated_highlight_is_found(tmp_path):
     """Eight pixels of one line in each frame: none of the lines that are looked at in any case."""
-    scene = override(load_scene("sphere"), size_px=24, bands=4, frames=2, effects=NOISE)
-    folder = simulate_session(scene, tmp_path / "session", progress=False)
-    saturated = {}
-    for capture in open_session(folder).frames:
+    session, saturated = simulated(tmp_path, size_px=24, bands=4, frames=2, effects=NOISE), {}
+    for capture in session.frames:
         counts = np.array(capture.cube.memmap())
         counts[13, 8:16] = 4095
         write_cube(capture.cube.header_path, counts, wavelengths_nm=capture.cube.wavelengths_nm)
         saturated[capture.name] = counts >= 4095
-    session = open_session(folder)
+    session = open_session(session.path)
     calibration = calibrate_session(session, CalibrationConfig())
     pack_frames(session, calibration, tmp_path / "data")
     for capture in session.frames:
@@ -212,13 +214,11 @@ def own_white(session: Session, capture, lines=3):
 
 @pytest.mark.slow
 def test_other_sources_of_white(tmp_path):
-    scene = override(load_scene("sphere"), size_px=48, bands=12, frames=3, effects=[])
-    folder = simulate_session(scene, tmp_path / "session", progress=False)
-    session = open_session(folder)
+    session = simulated(tmp_path)
     by_tarp = calibrate_session(session, CalibrationConfig())
     for capture in session.frames:
         own_white(session, capture)
-    session = open_session(folder)
+    session = open_session(session.path)
     by_capture = calibrate_session(session, CalibrationConfig(white_source="capture"))
     assert by_capture.source == "capture"
     inside = slice(8, -8)  # where the tarp is
@@ -226,20 +226,17 @@ def test_other_sources_of_white(tmp_path):
 
     # The chamber's wall as a target inside the frames.
     by_target = calibrate_session(session, CalibrationConfig(white_source="target", roi=(0, 0, 8, 8)))
-    wall = load_truth(folder).light(session.frames[0].name).radiance()[0, 0]
+    wall = load_truth(session.path).light(session.frames[0].name).radiance()[0, 0]
     np.testing.assert_allclose(by_target.frames[0].gain[0] * wall, by_tarp.frames[0].gain[0], rtol=0.01)
     assert not by_target.drift_corrected
 
 
 @pytest.mark.parametrize("copies", [True, False])
 def test_drift_is_taken_off_where_one_white_was_copied_beside_every_frame(tmp_path, copies):
-    effects = ["{lamp_drift: {percent: -6}}", "photon_noise", "read_noise"]
-    scene = override(load_scene("sphere"), size_px=48, bands=12, frames=4, effects=effects)
-    folder = simulate_session(scene, tmp_path / "session", progress=False)
-    session = open_session(folder)
+    session = simulated(tmp_path, frames=4, effects=DRIFTING)
     for number, capture in enumerate(session.frames):
         own_white(session, capture, lines=3 if copies else 3 + number)
-    session = open_session(folder)
+    session = open_session(session.path)
     calibration = calibrate_session(session, CalibrationConfig(white_source="capture"))
     assert calibration.drift_corrected == copies
     told = {finding.name: finding.sentence for finding in check_calibration(session, calibration)}["drift"]
@@ -247,8 +244,7 @@ def test_drift_is_taken_off_where_one_white_was_copied_beside_every_frame(tmp_pa
 
 
 def test_the_uncertainty_is_that_of_the_shortest_exposure_whichever_frame_it_is(tmp_path):
-    scene = override(load_scene("sphere"), size_px=32, bands=8, frames=3, effects=["photon_noise", "read_noise"])
-    session = open_session(simulate_session(scene, tmp_path / "session", progress=False))
+    session = simulated(tmp_path, size_px=32, bands=8, effects=NOISE)
     usual = calibrate_session(session, CalibrationConfig()).uncertainty
     cube = session.frames[1].cube
     short = replace(session.frames[1], cube=replace(cube, integration_time_ms=cube.integration_time_ms / 4.0))
@@ -259,9 +255,7 @@ def test_the_uncertainty_is_that_of_the_shortest_exposure_whichever_frame_it_is(
 
 
 def test_bands_that_are_listed_as_bad_do_not_hide_the_drift_of_the_others(tmp_path):
-    effects = ["{lamp_drift: {percent: -6}}", "photon_noise", "read_noise"]
-    scene = override(load_scene("sphere"), size_px=48, bands=12, frames=4, effects=effects)
-    session = open_session(simulate_session(scene, tmp_path / "session", progress=False))
+    session = simulated(tmp_path, frames=4, effects=DRIFTING)
     whole = calibrate_session(session, CalibrationConfig()).drift
     rng, listed = np.random.default_rng(0), np.arange(12) % 4 != 1
     for cube in (cube for capture in session.captures for cube in capture.cubes):
@@ -275,8 +269,7 @@ def test_bands_that_are_listed_as_bad_do_not_hide_the_drift_of_the_others(tmp_pa
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_a_band_without_data_leaves_the_uncertainty_of_the_others(tmp_path):
-    scene = override(load_scene("sphere"), size_px=48, bands=12, frames=3, effects=["photon_noise", "read_noise"])
-    session = open_session(simulate_session(scene, tmp_path / "session", progress=False))
+    session = simulated(tmp_path, effects=["photon_noise", "read_noise"])
     whole = calibrate_session(session, CalibrationConfig())
     for capture in session.captures:
         for cube in (capture.cube, capture.dark):
@@ -291,8 +284,7 @@ def test_a_band_without_data_leaves_the_uncertainty_of_the_others(tmp_path):
 
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory) -> Session:
-    scene = override(load_scene("sphere"), size_px=24, bands=4, frames=2, effects=[])
-    return open_session(simulate_session(scene, tmp_path_factory.mktemp("tiny") / "session", progress=False))
+    return simulated(tmp_path_factory.mktemp("tiny"), size_px=24, bands=4, frames=2)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """Whole SPECIM IQ captures: metadata, whites of their own, finished reflectance, images on their side."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,8 @@ from capture_factory import BANDS, SIZE_PX, WAVELENGTHS_NM
 from hsi_sc_nerf.calibration.white_source import white_source
 from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.capture.instrument import natural_order, read_metadata
-from hsi_sc_nerf.capture.session import open_session
+from hsi_sc_nerf.capture.session import Session, open_session
+from hsi_sc_nerf.capture.session_info import SessionInfo
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.processing.frames import capture_files, session_files
 
@@ -110,18 +110,12 @@ def test_finished_reflectance_alone(tmp_path):
     np.testing.assert_array_equal(first.cube.read(), REFLECTANCE)
 
 
-def test_a_tarp_beside_frames_that_have_everything(tmp_path):
-    write_capture(two(tmp_path), "white_reference", tints=(2.5, None))
+@pytest.mark.parametrize("raw", [True, False])
+def test_a_tarp_beside_frames_that_have_everything_is_a_white_if_it_has_counts(tmp_path, raw):
+    write_capture(two(tmp_path), "white_reference", counts=raw, white=raw, white_dark=raw, tints=(2.5, None))
     session = open_session(tmp_path)
-    assert session.white.integration_time_ms == 2.5
+    assert (session.white and session.white.integration_time_ms) == (2.5 if raw else None)
     assert [frame.name for frame in session.frames] == ["444", "445"]
-
-
-def test_a_tarp_without_counts_is_no_white(tmp_path):
-    write_capture(two(tmp_path), "white_reference", counts=False, white=False, white_dark=False)
-    session = open_session(tmp_path)
-    assert session.white is None
-    assert len(session.frames) == 2
 
 
 @pytest.mark.parametrize(
@@ -210,9 +204,7 @@ def test_a_real_instrument_lies_on_its_side(tmp_path, fields, rotation_deg):
 
 @pytest.mark.parametrize("rotation_deg", [0, 90, 180, 270])
 def test_quarter_turns_set_upright(tmp_path, rotation_deg):
-    two(tmp_path, xml=XML.format(time=10, mode="Custom"))
-    (tmp_path / "session.json").write_text(json.dumps({"image_rotation_deg": rotation_deg}))
-    session = open_session(tmp_path)
+    session = Session(tmp_path, SessionInfo(), None, (), rotation_deg)
     upright = np.arange(6).reshape(2, 3)
     lying = np.rot90(upright, rotation_deg // 90)
     np.testing.assert_array_equal(np.rot90(lying, session.quarter_turns), upright)
