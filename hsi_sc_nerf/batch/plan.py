@@ -68,7 +68,7 @@ def write_plan(out: Path, rows: Sequence[Row], settings: SessionSettings, kept: 
             one of them, or has a list that no batch wrote.
     """
     for row in rows:
-        _settings_of(row, settings)
+        settings_of(row, settings)
     _require_free(out, rows)
     kept = out if kept is None else kept
     make_folder(kept)
@@ -105,7 +105,7 @@ def read_plan(out: Path, kept: Path | None = None) -> dict[str, PlannedObject]:
         raise InputError(f"{kept / SETTINGS_NAME}: are no settings of a batch; {_AGAIN}.") from error
     root = out.resolve() / OBJECTS_NAME
     return {
-        row[OBJECT]: PlannedObject(Path(row[SESSION]), root / row[OBJECT], _settings_of(row, settings), caller)
+        row[OBJECT]: PlannedObject(Path(row[SESSION]), root / row[OBJECT], settings_of(row, settings), caller)
         for row in read_sessions(kept / LIST_NAME, may_be_gone=True)
     }
 
@@ -185,8 +185,12 @@ def _check_types(settings: SessionSettings) -> None:
         raise TypeError("a setting has the type of another")
 
 
-def _settings_of(row: Row, settings: SessionSettings) -> SessionSettings:
-    """The settings of an object: the batch's, its own preset, and its own words after the batch's."""
+def settings_of(row: Row, settings: SessionSettings) -> SessionSettings:
+    """The settings of an object: the batch's, its own preset, and its own words after the batch's.
+
+    Raises:
+        InputError: there is no such preset, or words cannot be split.
+    """
     preset = row.get("preset") or settings.preset
     if preset not in get_args(Preset):
         choices = ", ".join(get_args(Preset))

@@ -6,7 +6,7 @@ import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from socket import gethostname
@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from hsi_sc_nerf import batch
-from hsi_sc_nerf.batch.plan import OBJECTS_NAME, STEPS, outdated, read_plan, unlisted, write_plan
+from hsi_sc_nerf.batch.plan import OBJECTS_NAME, STEPS, outdated, read_plan, settings_of, unlisted, write_plan
 from hsi_sc_nerf.batch.session_list import OBJECT, Row, read_sessions
 from hsi_sc_nerf.batch.session_steps import SessionSettings
 from hsi_sc_nerf.benchmark.steps import require_posix
@@ -76,18 +76,19 @@ class BatchCommand(SessionSettings):
         if find_spec("snakemake") is None:
             raise InputError("Snakemake is not installed; pip install 'hsi-sc-nerf[batch]' (Python 3.11 or newer).")
         out, rows = self.output_dir, read_sessions(self.sessions)
-        check_words(self, [out / OBJECTS_NAME / row[OBJECT] for row in rows])
+        settings = SessionSettings(**{name: getattr(self, name) for name in SessionSettings.__dataclass_fields__})
+        check_words(settings)
+        objects: dict[SessionSettings, list[str]] = {}
         for row in rows:
-            if row.get("process"):
-                try:
-                    own = replace(self, process=f"{self.process} {row['process']}")
-                    check_words(own, [out / OBJECTS_NAME / row[OBJECT]])
-                except InputError as error:
-                    raise InputError(f"the object {row[OBJECT]}: {error}") from error
+            objects.setdefault(settings_of(row, settings), []).append(row[OBJECT])
+        for own, names in objects.items():
+            try:
+                check_words(own, [out / OBJECTS_NAME / name for name in names])
+            except InputError as error:
+                raise InputError(f"the object {names[0]}: {error}") from error
         locking = not {"--unlock", "--nolock"} & {*self.other_words}
         if locking and any((out / _LOCKS).glob("*")):
             raise _taken(out)
-        settings = SessionSettings(**{name: getattr(self, name) for name in SessionSettings.__dataclass_fields__})
         if self.dry_run:
             with TemporaryDirectory() as folder:
                 kept = Path(folder) / "plan"

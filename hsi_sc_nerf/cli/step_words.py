@@ -17,6 +17,9 @@ from hsi_sc_nerf.benchmark.configurations import split_words
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.settings_file import check_options
 
+_GIVEN = ("--output-dir", "--output", "--load-config", "--experiment-name", "--timestamp", "--method-name")
+"""Options that say where a step reads or writes: the other steps go by them."""
+
 
 def check_words(settings: SessionSettings, outs: Sequence[Path] = ()) -> None:
     """Check the words for our commands; those for ns-train are left to it.
@@ -27,8 +30,13 @@ def check_words(settings: SessionSettings, outs: Sequence[Path] = ()) -> None:
 
     Raises:
         InputError: a command does not take its words, a number lies outside its range, or words name a file that
-            their own step replaces.
+            their own step replaces or another place for its results.
     """
+    for name in ("process", "train", "material", "traits"):
+        for word in split_words(getattr(settings, name)):
+            option = word.partition("=")[0].replace("_", "-")
+            if option in _GIVEN:
+                raise InputError(f"--{name}: {option} is given by the step itself; leave it out.")
     for out in outs:
         _require_inputs_kept(settings, out)
     from hsi_sc_nerf.cli.clouds import TraitsCommand

@@ -210,6 +210,17 @@ def test_words_that_name_a_result_of_one_of_the_objects_are_refused_before_the_f
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("row", ["a,s/a,--masks.pieces 0,", "a,s/a,,--timestamp mine"])
+def test_words_of_one_object_are_checked_before_the_first_step(tmp_path, row):
+    make_sessions(tmp_path / "s", ["a", "b"])
+    listed = tmp_path / "list.csv"
+    listed.write_text(f"object,session,process,train\nb,s/b,,\n{row}\n")
+    with pytest.raises(InputError, match=r"^the object a: --(process: --masks|train: --timestamp)"):
+        BatchCommand(sessions=listed, output_dir=tmp_path / "out").main()
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
 def test_six_sessions_of_which_two_fail(tmp_path, monkeypatch, command, capfd):
     """First the plan; then all; then nothing; then what was mended; then what was asked for."""
     pytest.importorskip("snakemake")

@@ -75,6 +75,12 @@ def test_nonsense_is_one_sentence(config, told):
         (SessionSettings(traits="--roi a 0 0 0 -1"), "--traits: region a: needs x y z and a radius above 0"),
         (SessionSettings(material="--white-azimuth-deg nan"), "--material: --white-azimuth-deg is nan"),
         (SessionSettings(material="--light none.json"), r"--material: none\.json: cannot be read"),
+        # The other steps would not find the results, after hours of training.
+        (SessionSettings(train="--vis viewer --timestamp mine"), "--train: --timestamp is given by the step itself"),
+        (SessionSettings(train="--output_dir=elsewhere"), "--train: --output-dir is given"),
+        (SessionSettings(process="--output-dir elsewhere"), "--process: --output-dir is given"),
+        (SessionSettings(material="--output other.ply"), "--material: --output is given"),
+        (SessionSettings(traits="--output-dir elsewhere"), "--traits: --output-dir is given"),
     ],
 )
 def test_words_for_a_step_are_refused_before_the_first(settings, told):
