@@ -88,6 +88,8 @@ def command_line(names: Sequence[str] = tuple(COMMANDS)) -> Any:
     """
     import tyro
 
+    # Of the docstrings of options, which are indented, it would keep the line breaks of the source.
+    tyro._strings.remove_single_line_breaks = _in_whole_lines
     classes = {name: _imported(name) if name in names else _listed(name) for name in COMMANDS}
     return Union[tuple(Annotated[made, tyro.conf.subcommand(name)] for name, made in classes.items())]  # noqa: UP007
 
@@ -95,6 +97,10 @@ def command_line(names: Sequence[str] = tuple(COMMANDS)) -> Any:
 def named_commands(words: Sequence[str]) -> tuple[str, ...]:
     """The commands that a command line needs: the one that it begins with, or none."""
     return tuple(word for word in words[:1] if word in COMMANDS)
+
+
+def _in_whole_lines(text: str) -> str:
+    return "\n\n".join(" ".join(paragraph.split()) for paragraph in text.split("\n\n"))
 
 
 def _imported(name: str) -> type:

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pressed_at_import
 import pytest
+import tyro
 
-from hsi_sc_nerf.cli.main import COMMANDS
+from hsi_sc_nerf.cli.main import COMMANDS, command_line
 from hsi_sc_nerf.cli.sessions import MarkersCommand
 from hsi_sc_nerf.errors import InputError
 
@@ -132,6 +133,14 @@ def test_a_disk_that_fills_up_in_process_is_one_line_and_leaves_nothing_half_wri
     assert not list(out.rglob("*.bip"))
     assert not list(out.rglob(".partial-*"))
     assert not (out / "transforms.json").exists()
+
+
+@pytest.mark.parametrize(("name", "told"), [("run", "little without a GPU;"), ("material", "this one. The object")])
+def test_help_breaks_lines_where_the_terminal_ends_and_not_where_the_source_does(monkeypatch, capsys, name, told):
+    monkeypatch.setenv("COLUMNS", "400")
+    with pytest.raises(SystemExit):
+        tyro.cli(command_line((name,)), args=[name, "--help"])
+    assert told in capsys.readouterr().out
 
 
 @pytest.mark.slow
