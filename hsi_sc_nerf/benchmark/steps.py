@@ -9,7 +9,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -90,6 +91,29 @@ def run_step(
             ended += ", most often because memory ran out: close other programs, or give it more memory"
         raise InputError(f"the step '{name}' {ended}; its output is {where} {log}.")
     return StepCost(name, time.perf_counter() - started, peak_memory_mib(usage))
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Keep other commands that run steps out of a folder, until the block or this process ends.
+
+    Raises:
+        InputError: another one works there.
+    """
+    require_posix()
+    import fcntl  # not on Windows
+
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError(f"{folder}: another command works there; wait for it, or choose another.") from error
+        except OSError:
+            pass  # a network drive that has no locks
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def require_posix() -> None:

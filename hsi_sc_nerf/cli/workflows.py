@@ -24,7 +24,7 @@ from hsi_sc_nerf.batch.session_steps import (
     bring_up_to_date,
     session_steps,
 )
-from hsi_sc_nerf.benchmark.steps import StepCost, own_cost, run_step, typed_command
+from hsi_sc_nerf.benchmark.steps import StepCost, alone_in, own_cost, run_step, typed_command
 from hsi_sc_nerf.capture.session import is_session
 from hsi_sc_nerf.cli.light import sentences
 from hsi_sc_nerf.cli.step_words import check_words
@@ -65,7 +65,8 @@ class RunCommand(SessionSettings):
         """Run the steps that are not up to date and print what was found.
 
         Raises:
-            InputError: a step failed, there is no session, or the output folder holds something else.
+            InputError: a step failed, there is no session, or the output folder holds something else or another run
+                works there.
         """
         check_options(self)
         check_words(self, [self.output_dir])
@@ -80,7 +81,13 @@ class RunCommand(SessionSettings):
             raise InputError(f"{self.session}: holds no captures; give the folder of a capture session.")
         make_folder(out)
         console = Console(highlight=False, soft_wrap=True)
-        count = len(session_steps(self.session, out, self))
+        with alone_in(out):
+            self._bring_up_to_date(console, run_step)
+        with content_of(out, "results that can be shown", f"delete its {STEPS_NAME} to make them again"):
+            _show_results(out, console)
+
+    def _bring_up_to_date(self, console: Console, run_step: StepRunner) -> None:
+        out, count = self.output_dir, len(session_steps(self.session, self.output_dir, self))
         for number in range(count):
             # Anew each time: the traits are of the cloud that the material's step leaves, or not.
             step = session_steps(self.session, out, self)[number]
@@ -92,8 +99,6 @@ class RunCommand(SessionSettings):
                     raise
                 step.remove_outputs()
                 console.print(f"[yellow]{escape(str(error))} The other steps do without.")
-        with content_of(out, "results that can be shown", f"delete its {STEPS_NAME} to make them again"):
-            _show_results(out, console)
 
 
 def _show_results(out: Path, console: Console) -> None:
@@ -152,11 +157,15 @@ class DemoCommand:
             InputError: a step failed, or the folder cannot be used.
         """
         check_options(self)
-        console, out = Console(), self.output_dir
-        logs = out / "logs"
+        out = self.output_dir
         make_folder(out)
         if any(out.iterdir()) and not (out / DEMO_MARK).is_file():
             raise InputError(f"{out}: holds something other than a demo; choose another --output-dir.")
+        with alone_in(out):
+            self._reconstruct(Console(), out)
+
+    def _reconstruct(self, console: Console, out: Path) -> None:
+        logs = out / "logs"
         make_folder(logs)
         with atomic_write(out / DEMO_MARK) as (mark,):
             mark.write_text(

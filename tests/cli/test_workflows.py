@@ -6,6 +6,7 @@ The demo has tests of its own (test_end_to_end.py); here is what it does to fold
 import io
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from steps_here import steps_here
 
 from hsi_sc_nerf.batch.session_steps import STEPS_NAME, Step
 from hsi_sc_nerf.benchmark.steps import own_cost
+from hsi_sc_nerf.cli import workflows
 from hsi_sc_nerf.cli.workflows import DemoCommand, RunCommand, _show_results
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
@@ -66,6 +68,8 @@ def done(printed):
 def killed(tiny_dataset, tmp_path_factory):
     """A run that was killed in its training, after the first checkpoint."""
     out = tmp_path_factory.mktemp("run") / "out"
+    write_json(out / STEPS_NAME, {})
+    shutil.copytree(tiny_dataset[0], out / "data")  # which `process` finds up to date
     words = [sys.executable, "-m", "hsi_sc_nerf.cli.main", "run", tiny_dataset[1], "--output-dir", out]
     words += [f"--{name.replace('_', '-')}={value}" for name, value in OPTIONS.items()]
     process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -171,6 +175,33 @@ def test_a_run_says_what_it_decided_of_the_light_and_does_without(tmp_path, caps
     # What failed left half of its results.
     assert (out / "point_cloud-material.ply").is_file() == found
     assert done_steps(out) == (set(ALL) if found else set(ALL) - {"material"})
+
+
+@pytest.mark.parametrize("kind", ["run", "demo"])
+def test_a_second_one_in_the_same_folder_is_refused_and_leaves_all_as_it_is(tmp_path, monkeypatch, kind):
+    """Both would train into one folder, and evaluate what the other one has left there."""
+    session, out = tmp_path / "session", tmp_path / "out"
+    (session / "a" / "capture").mkdir(parents=True)
+    command, called = RunCommand(session, out) if kind == "run" else DemoCommand(out), []
+
+    def run_step(name, argv, log):
+        called.append(name)
+        (out / "runs").mkdir(exist_ok=True)
+        before = sorted(out.rglob("*"))
+        if len(called) == 1:
+            with pytest.raises(InputError, match=r"out: another command works there"):
+                start()
+        assert sorted(out.rglob("*")) == before
+        raise InputError("it failed.")
+
+    def start():
+        command.main(run_step) if kind == "run" else command.main()
+
+    monkeypatch.setattr(workflows, "run_step", run_step)
+    for _ in range(2):  # the second time nobody works there
+        with pytest.raises(InputError, match="it failed"):
+            start()
+    assert len(called) == 2
 
 
 def done_steps(out):
