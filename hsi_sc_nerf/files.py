@@ -122,6 +122,17 @@ def require_writable(folder: Path) -> None:
         raise InputError(f"{folder}: cannot be written to, because {there} {why}; choose another folder.")
 
 
+def require_writable_file(path: Path) -> None:
+    """`require_writable` for a file to be written.
+
+    Raises:
+        InputError: a folder has its name, or its own folder cannot be written to.
+    """
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; give the name of a file in it.")
+    require_writable(path.parent)
+
+
 def read_json(path: Path, remedy: str) -> dict[str, Any]:
     """The object in a JSON file.
 

@@ -29,6 +29,21 @@ NOTHING = Path("nothing")
 @pytest.mark.parametrize(
     "command",
     [
+        lambda: ReportCommand(NOTHING, output=Path()),
+        lambda: SampleCommand(NOTHING, NOTHING, output=Path()),
+        lambda: SampleCommand(Path(), NOTHING),
+        lambda: MaterialCommand(Path(), NOTHING),
+    ],
+)
+def test_a_folder_in_the_place_of_a_file_is_told_before_anything_is_computed(tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=r"^\.: "):
+        command().main()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
         lambda out: ChangeCommand((NOTHING, NOTHING), out),
         lambda out: CompareCommand(NOTHING, NOTHING, out),
         lambda out: ExportCommand(NOTHING, out),

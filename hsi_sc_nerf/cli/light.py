@@ -82,7 +82,7 @@ class MaterialCommand:
         from hsi_sc_nerf.light.of_run import light_of_run
         from hsi_sc_nerf.models.trained_run import open_trained_run
 
-        output = self.output or self.cloud.with_name(f"{self.cloud.stem}-material.ply")
+        output = self.output or self.cloud.parent / f"{self.cloud.stem}-material.ply"
         require_writable(output.parent)
         file_format, stem = format_of(output), output.with_suffix("")
         cloud = read_spectral_ply(self.cloud)

@@ -15,7 +15,7 @@ from rich.markup import escape
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.options import CloudOptions
-from hsi_sc_nerf.files import require_writable
+from hsi_sc_nerf.files import require_writable, require_writable_file
 from hsi_sc_nerf.packed.of_run import require_dataset_of_run
 from hsi_sc_nerf.settings_file import between, check_options
 
@@ -100,8 +100,8 @@ class SampleCommand:
         from hsi_sc_nerf.export.sample_points import read_points, sample_points, write_sampled_ply
         from hsi_sc_nerf.models.trained_run import open_trained_run
 
-        output = self.output or self.points.with_name(f"{self.points.stem}-spectral.ply")
-        require_writable(output.parent)
+        output = self.output or self.points.parent / f"{self.points.stem}-spectral.ply"
+        require_writable_file(output)
         given = read_points(self.points)
         normals = given.normals()
         if run is None:
@@ -275,7 +275,7 @@ class ReportCommand:
         check_options(self)
         run = self.run.parent if self.run.name == "config.yml" else self.run
         output = self.output or run / "report.html"
-        require_writable(output.parent)
+        require_writable_file(output)
         require_dataset_of_run(run / "config.yml")
         from hsi_sc_nerf.report.build import write_report
 
