@@ -52,13 +52,16 @@ def record_step(one: PlannedObject, name: str, run_step: StepRunner) -> None:
     def run(step_name: str, argv: Sequence[str], _: Path) -> StepCost:
         if name == "inspect":
             step.remove_outputs()
-        return run_step(step_name, argv, log)
+        try:
+            return run_step(step_name, argv, log)
+        except InputError as error:
+            raise InputError(_told(log) or str(error)) from error
 
     try:
         cost = bring_up_to_date(step, one.folder, console, f"{one.folder.name} {name}", run)
     except InputError as error:
         cost = StepCost(name, time.perf_counter() - started, 0.0)
-        sentence = _told(log) or str(error)
+        sentence = str(error)
         # `inspect` ends so where it found something red as well, of which its result tells.
         if name != "inspect" or not step.outputs[0].is_file():
             status = "failed"

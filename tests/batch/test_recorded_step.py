@@ -10,7 +10,7 @@ from quick_steps import quick_run
 
 from hsi_sc_nerf.batch.plan import INSPECTION_NAME, STEPS, outdated, read_plan, write_plan
 from hsi_sc_nerf.batch.recorded_step import copy_record, record_step, runner_of
-from hsi_sc_nerf.batch.session_steps import SessionSettings
+from hsi_sc_nerf.batch.session_steps import STEPS_NAME, SessionSettings
 from hsi_sc_nerf.cli import sessions
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
@@ -158,6 +158,15 @@ def test_a_damaged_record_is_one_sentence(planned, content):
     one.record("process").write_text(content)
     with pytest.raises(InputError, match=r"process\.json: .*delete it and start"):
         do(one, ("train",))
+
+
+def test_what_fails_before_the_command_is_not_told_by_the_log_of_an_earlier_attempt(planned):
+    one = planned()["pear"]
+    (one.session / "broken").write_text("")
+    do(one, ["inspect", "process"])
+    (one.folder / STEPS_NAME).write_text("{")
+    do(one, ["process"])
+    assert json.loads(one.record("process").read_text())["sentence"].startswith(f"{STEPS_NAME}: is not a JSON")
 
 
 def test_without_the_material_the_other_steps_do_without(planned):
