@@ -18,51 +18,66 @@ _LARGEST = float(np.finfo(np.float32).max)
 _compiled = compiled(fastmath={"reassoc", "contract"})
 
 
+@_compiled
 def angles(a: Float32[np.ndarray, "n bands"], b: Float32[np.ndarray, "n bands"]) -> Float32[np.ndarray, "n"]:
     """`numerics.spectral_angle` of each pair of spectra."""
     found = np.empty(len(a), np.float32)
-    _angles(a, b, found)
+    for i in range(len(a)):
+        norm_a, norm_b = _norm(a[i]), _norm(b[i])
+        if norm_a == 0.0 or norm_b == 0.0:
+            # A NaN of the other spectrum is not hidden.
+            found[i] = math.pi / 2.0 + 0.0 * (norm_a + norm_b)
+        else:
+            difference, total = _chords(a[i], b[i], norm_a, norm_b)
+            found[i] = 2.0 * math.atan2(difference, total)
     return found
 
 
+@_compiled
 def angle_gradient(
     a: Float32[np.ndarray, "n bands"], b: Float32[np.ndarray, "n bands"], upstream: Float32[np.ndarray, "n"]
 ) -> Float32[np.ndarray, "n bands"]:
     """Gradient of a sum of the angles, each times its ``upstream``, with respect to ``a``."""
-    gradient = np.empty_like(a)
-    _angle_gradient(a, b, upstream, gradient)
-    return gradient
-
-
-def mean_square(a: Float32[np.ndarray, "n"], b: Float32[np.ndarray, "n"]) -> float:
-    """Mean of the squared differences; 0 of none."""
-    return _sum_of_squares(a, b) / max(len(a), 1)
-
-
-def mean_square_gradient(
-    a: Float32[np.ndarray, "n"], b: Float32[np.ndarray, "n"], upstream: float
-) -> Float32[np.ndarray, "n"]:
-    """Gradient of ``upstream`` times their mean square with respect to ``a``."""
-    gradient = np.empty_like(a)
-    _scaled_difference(a, b, 2.0 * upstream / max(len(a), 1), gradient)
+    gradient = np.zeros_like(a)
+    for i in range(len(a)):
+        norm_a, norm_b = _norm(a[i]), _norm(b[i])
+        if norm_a == 0.0 or norm_b == 0.0:
+            continue
+        difference, total = _chords(a[i], b[i], norm_a, norm_b)
+        if difference == 0.0 or total == 0.0:
+            continue
+        # d angle / d u = -(v - cos u) / sin, with 1 - cos = difference^2 / 2 and sin = difference total / 2.
+        factor = -upstream[i] / (norm_a * 0.5 * difference * total)
+        past = 0.5 * difference * difference
+        of_a, of_b = 1.0 / norm_a, 1.0 / norm_b
+        for k in range(a.shape[1]):
+            u, v = a[i, k] * of_a, b[i, k] * of_b
+            value = factor * ((v - u) + past * u)
+            gradient[i, k] = min(max(value, -_LARGEST), _LARGEST)
     return gradient
 
 
 @_compiled
-def _sum_of_squares(a, b):
+def mean_square(a: Float32[np.ndarray, "n"], b: Float32[np.ndarray, "n"]) -> float:
+    """Mean of the squared differences; 0 of none."""
     total = 0.0
     for i in range(len(a)):
         difference = np.float64(a[i]) - np.float64(b[i])
         total += difference * difference
-    return total
+    return total / max(len(a), 1)
 
 
 @_compiled
-def _scaled_difference(a, b, factor, found):
+def mean_square_gradient(
+    a: Float32[np.ndarray, "n"], b: Float32[np.ndarray, "n"], upstream: float
+) -> Float32[np.ndarray, "n"]:
+    """Gradient of ``upstream`` times their mean square with respect to ``a``."""
+    gradient, factor = np.empty_like(a), 2.0 * upstream / max(len(a), 1)
     for i in range(len(a)):
         value = factor * (np.float64(a[i]) - np.float64(b[i]))
         # Written so that NaN is not hidden.
-        found[i] = -_LARGEST if value < -_LARGEST else _LARGEST if value > _LARGEST else value
+        gradient[i] = -_LARGEST if value < -_LARGEST else _LARGEST if value > _LARGEST else value
+    return gradient
 
 
 @_compiled
@@ -83,35 +98,3 @@ def _chords(a, b, norm_a, norm_b):
         difference += (u - v) * (u - v)
         total += (u + v) * (u + v)
     return math.sqrt(difference), math.sqrt(total)
-
-
-@_compiled
-def _angles(a, b, found):
-    for i in range(len(a)):
-        norm_a, norm_b = _norm(a[i]), _norm(b[i])
-        if norm_a == 0.0 or norm_b == 0.0:
-            # A NaN of the other spectrum is not hidden.
-            found[i] = math.pi / 2.0 + 0.0 * (norm_a + norm_b)
-        else:
-            difference, total = _chords(a[i], b[i], norm_a, norm_b)
-            found[i] = 2.0 * math.atan2(difference, total)
-
-
-@_compiled
-def _angle_gradient(a, b, upstream, gradient):
-    for i in range(len(a)):
-        norm_a, norm_b = _norm(a[i]), _norm(b[i])
-        gradient[i] = 0.0
-        if norm_a == 0.0 or norm_b == 0.0:
-            continue
-        difference, total = _chords(a[i], b[i], norm_a, norm_b)
-        if difference == 0.0 or total == 0.0:
-            continue
-        # d angle / d u = -(v - cos u) / sin, with 1 - cos = difference^2 / 2 and sin = difference total / 2.
-        factor = -upstream[i] / (norm_a * 0.5 * difference * total)
-        past = 0.5 * difference * difference
-        of_a, of_b = 1.0 / norm_a, 1.0 / norm_b
-        for k in range(a.shape[1]):
-            u, v = a[i, k] * of_a, b[i, k] * of_b
-            value = factor * ((v - u) + past * u)
-            gradient[i, k] = min(max(value, -_LARGEST), _LARGEST)
