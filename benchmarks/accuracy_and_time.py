@@ -30,7 +30,7 @@ import tyro
 from accuracy_front import DEFAULT, TITLES, draw_front, table_rows
 from beyond_the_paper import SHADING, noise_free_metrics
 from jaxtyping import Float
-from paper_tables import PaperTable
+from paper_tables import PaperTable, judged_once
 from results_table import read_results, write_results
 from traits_accuracy import spots_on
 from true_object import TrueObject, relative_rms
@@ -230,15 +230,15 @@ class AccuracyAndTime(PaperTable):
         folder_name = _folder_name(name) if words else DEFAULT
         runs = folder / f"runs-{self.iterations}-{seed}"
         (run,) = self.trained([own_configuration(f"{folder_name}={words}")], data, runs, seed)
-        kept = runs / run.name / "judged.json"
-        if not kept.is_file() or kept.stat().st_mtime < (runs / run.name / "result.json").stat().st_mtime:
-            config = runs / run.name / "benchmark" / run.method / "run" / "config.yml"
-            last = run.checkpoints[-1]
-            found = {"steps": float(last.iteration), "memory_mib": last.peak_memory_mib}
-            found |= {metric: last.metrics[metric] for metric in ("sam", "rmse")}
-            found |= noise_free_metrics(config, folder / "noise-free-data", self.held_out_views)
-            write_json(kept, found | surface_figures(config, folder / "session"))
-        return read_json(kept, "delete it to judge the run again")
+        last = run.checkpoints[-1]
+        known = {"steps": float(last.iteration), "memory_mib": last.peak_memory_mib}
+        known |= {metric: last.metrics[metric] for metric in ("sam", "rmse")}
+
+        def judge(config: Path) -> dict[str, float]:
+            views = noise_free_metrics(config, folder / "noise-free-data", self.held_out_views)
+            return known | views | surface_figures(config, folder / "session")
+
+        return judged_once(runs, run, judge)
 
 
 def _folder_name(text: str) -> str:

@@ -13,7 +13,6 @@ surface: with all of it, and with what at least one camera can see.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,19 +21,19 @@ import numpy as np
 import torch
 import tyro
 from jaxtyping import Bool, Float
-from paper_tables import METRICS, PaperTable, mean_and_deviation
+from paper_tables import METRICS, PaperTable, judged_once, mean_and_deviation, rendered_views
 from results_table import write_results
 from torch import Tensor
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.benchmark.configurations import named_configuration
-from hsi_sc_nerf.benchmark.run import BenchmarkRun, HeldOutViews
+from hsi_sc_nerf.benchmark.run import BenchmarkRun
 from hsi_sc_nerf.benchmark.steps import run_step, typed_command
 from hsi_sc_nerf.capture.envi import open_cube
 from hsi_sc_nerf.evaluation.comparison import CompareConfig, read_surface
 from hsi_sc_nerf.evaluation.spatial import Surface, score_at
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_metrics
-from hsi_sc_nerf.files import write_json
+from hsi_sc_nerf.models.trained_run import open_trained_run
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.processing.frames import FramePaths
@@ -92,31 +91,21 @@ class BeyondThePaper(PaperTable):
 
     def _judged(self, folder: Path, runs: Path, run: BenchmarkRun) -> dict[str, float]:
         """What the benchmark itself does not measure: views against noise-free ones, the cloud against the truth."""
-        trained = runs / run.name
-        kept = trained / "judged.json"
-        if not kept.is_file() or kept.stat().st_mtime < (trained / "result.json").stat().st_mtime:
-            config = trained / "benchmark" / run.method / "run" / "config.yml"
-            judged = noise_free_metrics(config, folder / "noise-free-data", self.held_out_views)
-            judged |= cloud_scores(config, folder, trained)
-            write_json(kept, judged)
-        return json.loads(kept.read_text(encoding="utf-8"))
+
+        def judge(config: Path) -> dict[str, float]:
+            views = noise_free_metrics(config, folder / "noise-free-data", self.held_out_views)
+            return views | cloud_scores(config, folder, runs / run.name)
+
+        return judged_once(runs, run, judge)
 
 
 def noise_free_metrics(config: Path, noise_free: Path, held_out_views: int | None) -> dict[str, float]:
     """Held-out views against noise-free ones, means over views: ``clean_`` the model's, ``noise_`` the measured."""
-    from nerfstudio.utils.eval_utils import eval_setup
-
-    _, pipeline, _, _ = eval_setup(config, test_mode="test")
-    pipeline.eval()
-    manager = pipeline.datamanager
-    frames = manager.eval_dataset.metadata["frames"]
     found: list[dict[str, float]] = []
-    for camera, batch in HeldOutViews(manager.fixed_indices_eval_dataloader, held_out_views):
-        with torch.no_grad():
-            rendered = pipeline.model.get_outputs_for_camera(camera)["spectral"]
-        reflectance, valid = reflectance_of(noise_free, frames[batch["image_idx"]].capture)
+    for capture, rendered, batch in rendered_views(open_trained_run(config), held_out_views):
+        reflectance, valid = reflectance_of(noise_free, capture)
         mask = batch["mask"][..., 0].bool()
-        for prefix, image in (("clean_", rendered.cpu()), ("noise_", batch["spectral"])):
+        for prefix, image in (("clean_", rendered), ("noise_", batch["spectral"])):
             metrics = spectral_metrics(image, reflectance, mask, valid)
             found.append({prefix + name: metrics[name] for name in METRICS})
     return {name: float(np.mean([view[name] for view in found if name in view])) for name in found[0] | found[1]}

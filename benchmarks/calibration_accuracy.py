@@ -11,11 +11,10 @@ scatters from frame to frame. Its path-traced sessions are made by benchmarks/in
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Literal
 
 import numpy as np
@@ -141,9 +140,8 @@ class CalibrationAccuracy:
         """Measured and true drift of one session, by the scatter that is added to it."""
         effects = (WARM_UP, *NOISE)
         scene = override(load_scene(self.scene), size_px=self.size, frames=self.frames, effects=effects, seed=seed)
-        folder = Path(tempfile.mkdtemp())
-        try:
-            session = open_session(simulate_session(scene, folder / "session", progress=False))
+        with TemporaryDirectory() as folder:
+            session = open_session(simulate_session(scene, Path(folder, "session"), progress=False))
             truth = load_truth(session.path)
             light = np.stack([lamp_output(truth, capture.name) for capture in session.frames])
             original = [capture.cube.read() for capture in session.frames]
@@ -152,22 +150,17 @@ class CalibrationAccuracy:
                 for number, capture in enumerate(session.frames):
                     _scatter(capture, original[number], *strength, seed=1000 * seed + number)
                 drifts[name] = calibrate_session(session, PLAIN).drift, light / light[0]
-        finally:
-            shutil.rmtree(folder)
         return drifts
 
     def _score(self, effects: tuple[str, ...], config: CalibrationConfig) -> CalibrationScore:
         scene = override(load_scene(self.scene), size_px=self.size, frames=self.frames, effects=effects)
-        folder = Path(tempfile.mkdtemp())
-        try:
-            session = open_session(simulate_session(scene, folder / "session", progress=False))
-            calibration = calibrate_session(session, config)
-            pack_frames(session, calibration, folder / "packed")
+        with TemporaryDirectory() as temporary:
+            session = open_session(simulate_session(scene, Path(temporary, "session"), progress=False))
+            calibration, packed = calibrate_session(session, config), Path(temporary, "packed")
+            pack_frames(session, calibration, packed)
             if self.pictures is not None and effects:
                 draw_calibration(self.pictures, session, calibration, paper.PSEUDO_RGB_NM)
-            return score_calibration(session, calibration, folder / "packed", load_truth(session.path))
-        finally:
-            shutil.rmtree(folder)
+            return score_calibration(session, calibration, packed, load_truth(session.path))
 
 
 def _cells(score: CalibrationScore) -> list[str]:

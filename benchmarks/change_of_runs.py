@@ -155,17 +155,9 @@ class ChangeOfRuns:
             scene = replace(load_scene("apple"), object=own, materials=dried_materials(day, self.kind))
             scene = override(scene, frames=FRAMES, size_px=SIZE_PX, bands=BANDS, seed=10 * seed + at, effects=EFFECTS)
             simulate_session(scene, session)
-        training = [
-            "ns-train",
-            "hsi-sc-nerf",
-            "--data",
-            data,
-            "--output-dir",
-            folder,
-            "--experiment-name",
-            "training",
-        ]
-        training += ["--timestamp", "run", "--vis", "tensorboard", "--preset", "fast", "--evaluate-stages", "False"]
+        training = ["ns-train", "hsi-sc-nerf", "--data", data, "--output-dir", folder]
+        training += ["--experiment-name", "training", "--timestamp", "run", "--vis", "tensorboard"]
+        training += ["--preset", "fast", "--evaluate-stages", "False"]
         exporting = ["ns-export", "pointcloud", "--load-config", run / "config.yml", "--output-dir", cloud.parent]
         steps: Sequence[tuple[str, Path, Sequence[object]]] = (
             ("process", data / "transforms.json", ["hsi-sc-nerf", "process", session, "--output-dir", data]),

@@ -20,17 +20,17 @@ import numpy as np
 import torch
 import tyro
 from accuracy_and_time import step_seconds
-from paper_tables import PaperTable, mean_and_deviation
+from paper_tables import PaperTable, judged_once, mean_and_deviation, rendered_views
 from results_table import write_results
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.benchmark.configurations import own_configuration
-from hsi_sc_nerf.benchmark.run import HeldOutViews
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_metrics
 from hsi_sc_nerf.files import read_json, write_json
 from hsi_sc_nerf.findings import EffectEvidence
 from hsi_sc_nerf.geometry.camera import rotation_about_z
 from hsi_sc_nerf.models.chosen_effects import MODEL_EFFECTS, chosen_effects, effects_setting
+from hsi_sc_nerf.models.trained_run import open_trained_run
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.poses.pose_methods import find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
@@ -173,11 +173,8 @@ class Effects(PaperTable):
         name = setting.replace(",", "-").replace("_", "-")
         runs = data.with_name(f"{data.name}-runs-{seed}")
         (run,) = self.trained([own_configuration(f"{name}=--pipeline.model.effects {setting}")], data, runs, seed)
-        kept = runs / name / "judged.json"
-        if not kept.is_file() or kept.stat().st_mtime < (runs / name / "result.json").stat().st_mtime:
-            config = runs / name / "benchmark" / run.method / "run" / "config.yml"
-            write_json(kept, against_truth(config, data.with_name(data.name.removesuffix("-data"))))
-        return read_json(kept, "delete it to judge the run again")
+        session = data.with_name(data.name.removesuffix("-data"))
+        return judged_once(runs, run, partial(against_truth, session))
 
 
 def disturbed_poses(error_deg: float, *arguments: Any, **options: Any) -> TurntablePoses:
@@ -197,19 +194,12 @@ def disturbed_poses(error_deg: float, *arguments: Any, **options: Any) -> Turnta
     return replace(poses, camera_to_world=np.stack(turns) @ wrong, uncertainty=stated)
 
 
-def against_truth(config: Path, session: Path) -> dict[str, float]:
+def against_truth(session: Path, config: Path) -> dict[str, float]:
     """Held-out views against the noise-free light, means over views: on the object, and RMSE beside it."""
-    from nerfstudio.utils.eval_utils import eval_setup
-
-    _, pipeline, _, _ = eval_setup(config, test_mode="test")
-    pipeline.eval()
-    manager, truth = pipeline.datamanager, load_truth(session)
-    frames = manager.eval_dataset.metadata["frames"]
+    truth = load_truth(session)
     found: list[dict[str, float]] = []
-    for camera, batch in HeldOutViews(manager.fixed_indices_eval_dataloader, None):
-        with torch.no_grad():
-            rendered = pipeline.model.get_outputs_for_camera(camera)["spectral"].cpu()
-        light = torch.from_numpy(truth.light(frames[batch["image_idx"]].capture).radiance()).to(rendered)
+    for capture, rendered, batch in rendered_views(open_trained_run(config)):
+        light = torch.from_numpy(truth.light(capture).radiance()).to(rendered)
         mask = batch["mask"][..., 0].bool()
         metrics = spectral_metrics(rendered, light, mask)
         beside = (rendered - light)[~mask].square().mean().sqrt()

@@ -7,6 +7,7 @@ import re
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -24,12 +25,15 @@ LINES_NM, LINE_WIDTH_NM, LINE_HEIGHT = (546.0, 611.0), 4.0, 0.3
 Cubes = Callable[[np.ndarray], np.ndarray]
 
 
+Make = Callable[[Path, Path, Path], None]
+
+
 @dataclass(frozen=True)
 class Mistake:
     """One mistake, and the words with which `process` is called."""
 
     name: str
-    make: Callable[[Path, Path, Path], None]
+    make: Make
     """Makes it in the folder of a copy; the second folder is the session itself with its truth, the third one of two
     frames of another object."""
     words: tuple[str, ...] = ()
@@ -99,6 +103,30 @@ def _white_light(session: Path) -> np.ndarray:
 def _light(change: Cubes, dark: float) -> Cubes:
     """A change of counts by one of the light above dark."""
     return lambda counts: dark + change(counts - dark)
+
+
+def _in_frames(change_in: Callable[[Path], Cubes]) -> Make:
+    """A change of all frames, which the session tells."""
+
+    def make(session: Path, source: Path, other: Path) -> None:
+        change = change_in(session)
+        for frame in frames_of(session):
+            edit_cube(header_of(frame), change)
+
+    return make
+
+
+def _in_white_light(change: Cubes) -> Make:
+    """A change of the white's counts above dark."""
+    return lambda session, *_: edit_cube(header_of(_white(session)), _light(change, _dark_level(session)))
+
+
+def _in_all_cubes(change: Cubes) -> Make:
+    def make(session: Path, source: Path, other: Path) -> None:
+        for header in session.rglob("*.hdr"):
+            edit_cube(header, change)
+
+    return make
 
 
 def nothing(session: Path, source: Path, other: Path) -> None:
@@ -188,54 +216,25 @@ def _shadow(session: Path, source: Path, other: Path) -> None:
         edit_cube(header_of(frame), _light(lambda light, by=factor: light * by[..., None], dark))
 
 
-def _stretched(factor: float) -> Callable[[Path, Path, Path], None]:
+def _stretched(factor: float, counts: np.ndarray) -> np.ndarray:
     """Lines that lie closer: more of them for the same scene, cut to as many as before."""
-
-    def stretch(counts: np.ndarray) -> np.ndarray:
-        lines, samples, _ = counts.shape
-        longer = round(lines * factor)
-        resized = np.stack(
-            [
-                cv2.resize(band, (samples, longer), interpolation=cv2.INTER_CUBIC)
-                for band in np.moveaxis(counts, -1, 0)
-            ],
-            axis=-1,
-        )
-        first = (longer - lines) // 2
-        return resized[first : first + lines]
-
-    def make(session: Path, source: Path, other: Path) -> None:
-        for frame in frames_of(session):
-            edit_cube(header_of(frame), stretch)
-
-    return make
+    lines, samples, _ = counts.shape
+    longer = round(lines * factor)
+    bands = (
+        cv2.resize(band, (samples, longer), interpolation=cv2.INTER_CUBIC) for band in np.moveaxis(counts, -1, 0)
+    )
+    first = (longer - lines) // 2
+    return np.stack([*bands], axis=-1)[first : first + lines]
 
 
-def _mirrored(session: Path, source: Path, other: Path) -> None:
-    for header in session.rglob("*.hdr"):
-        edit_cube(header, lambda counts: counts[:, ::-1])
+def _half_in_shade(light: np.ndarray) -> np.ndarray:
+    return light * np.where(np.arange(light.shape[1]) < light.shape[1] // 2, LIT, 1.0)[:, None]
 
 
-def _grey_card(session: Path, source: Path, other: Path) -> None:
-    dark = _dark_level(session)
-    edit_cube(header_of(_white(session)), _light(lambda light: 0.4 * light, dark))
-
-
-def _half_in_shade(session: Path, source: Path, other: Path) -> None:
-    dark = _dark_level(session)
-
-    def shade(light: np.ndarray) -> np.ndarray:
-        return light * np.where(np.arange(light.shape[1]) < light.shape[1] // 2, LIT, 1.0)[:, None]
-
-    edit_cube(header_of(_white(session)), _light(shade, dark))
-
-
-def _room_lamp(session: Path, source: Path, other: Path) -> None:
-    dark = _dark_level(session)
+def _room_lamp(session: Path) -> Cubes:
     nm = open_cube(header_of(_white(session))).wavelengths_nm
     factor = 1.0 + LINE_HEIGHT * sum(np.exp(-0.5 * ((nm - line) / LINE_WIDTH_NM) ** 2) for line in LINES_NM)
-    for frame in frames_of(session):
-        edit_cube(header_of(frame), _light(lambda light: light * factor, dark))
+    return _light(lambda light: light * factor, _dark_level(session))
 
 
 def _nan_bands(session: Path, source: Path, other: Path) -> None:
@@ -247,11 +246,10 @@ def _nan_bands(session: Path, source: Path, other: Path) -> None:
         counts[rng.random(counts.shape, np.float32) < 0.001] = np.nan
         return counts
 
-    for header in session.rglob("*.hdr"):
-        edit_cube(header, drop)
+    _in_all_cubes(drop)(session, source, other)
 
 
-def _sized(factor: float, container: bool) -> Callable[[Path, Path, Path], None]:
+def _sized(factor: float, container: bool) -> Make:
     def make(session: Path, source: Path, other: Path) -> None:
         without = {} if container else {"container_diameter_m": None, "container_height_m": None}
         _state(session, marker_side_m=factor * float(str(stated(session)["marker_side_m"])), **without)
@@ -269,19 +267,9 @@ def _other_direction(session: Path, source: Path, other: Path) -> None:
     _state(session, direction="ccw" if stated(session)["direction"] == "cw" else "cw")
 
 
-def _half_exposed(session: Path, source: Path, other: Path) -> None:
-    dark = _dark_level(session)
-    for frame in frames_of(session):
-        edit_cube(header_of(frame), _light(lambda light: 0.5 * light, dark))
-
-
-def _veil(fraction: float) -> Callable[[Path, Path, Path], None]:
-    def make(session: Path, source: Path, other: Path) -> None:
-        light = fraction * _white_light(session)
-        for frame in frames_of(session):
-            edit_cube(header_of(frame), lambda counts: counts + light)
-
-    return make
+def _veil(fraction: float, session: Path) -> Cubes:
+    light = fraction * _white_light(session)
+    return lambda counts: counts + light
 
 
 def _reversed_wavelengths(session: Path, source: Path, other: Path) -> None:
@@ -311,19 +299,22 @@ MISTAKES = [
     Mistake("one dark cube is missing", _without_dark),
     Mistake("the object slips by one step", _slip),
     Mistake("a shadow on the object in two frames, -40 %", _shadow),
-    Mistake("pixels not square by 5 %", _stretched(1.05)),
-    Mistake("mirrored images", _mirrored),
-    Mistake("a grey card as white, 40 %", _grey_card),
-    Mistake("white half in shade, -40 %", _half_in_shade),
-    Mistake("a room's lamp on the frames only", _room_lamp),
+    Mistake("pixels not square by 5 %", _in_frames(lambda _: partial(_stretched, 1.05))),
+    Mistake("mirrored images", _in_all_cubes(lambda counts: counts[:, ::-1])),
+    Mistake("a grey card as white, 40 %", _in_white_light(lambda light: 0.4 * light)),
+    Mistake("white half in shade, -40 %", _in_white_light(_half_in_shade)),
+    Mistake("a room's lamp on the frames only", _in_frames(_room_lamp)),
     Mistake("NaN in bands and values", _nan_bands),
     Mistake("marker side in cm", _sized(100.0, container=False)),
     Mistake("marker side 10 % too long, container stated", _sized(1.1, container=True)),
     Mistake("marker side 10 % too long, no other length", _sized(1.1, container=False)),
     Mistake("marker side 10 % too long, camera distance stated", _sized_with_distance),
     Mistake("the other direction stated", _other_direction),
-    Mistake("frames exposed half as long as stated", _half_exposed),
-    Mistake("stray light of 5 % over all frames", _veil(0.05)),
-    Mistake("stray light of 20 % over all frames", _veil(0.2)),
+    Mistake(
+        "frames exposed half as long as stated",
+        _in_frames(lambda session: _light(lambda light: 0.5 * light, _dark_level(session))),
+    ),
+    Mistake("stray light of 5 % over all frames", _in_frames(partial(_veil, 0.05))),
+    Mistake("stray light of 20 % over all frames", _in_frames(partial(_veil, 0.2))),
     Mistake("wavelengths listed in reverse", _reversed_wavelengths),
 ]

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 from results_table import RESULTS
+from torch import Tensor
 
 from hsi_sc_nerf.benchmark.configurations import Configuration
-from hsi_sc_nerf.benchmark.run import BenchmarkRun
+from hsi_sc_nerf.benchmark.run import BenchmarkRun, HeldOutViews
 from hsi_sc_nerf.cli.benchmark import BenchmarkCommand, train_all
+from hsi_sc_nerf.files import read_json, write_json
 from hsi_sc_nerf.models.schedule import Clock
+from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.poses.pose_methods import find_poses
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.processing.process import process_session
@@ -83,6 +88,24 @@ class PaperTable:
             threads=self.threads,
         )
         return train_all(configurations, command)
+
+
+def judged_once(runs: Path, run: BenchmarkRun, judge: Callable[[Path], Mapping[str, float]]) -> dict[str, float]:
+    """What ``judge`` finds of a run by its ``config.yml``, kept beside the run's result."""
+    folder = runs / run.name
+    kept = folder / "judged.json"
+    if not kept.is_file() or kept.stat().st_mtime < (folder / "result.json").stat().st_mtime:
+        write_json(kept, {**judge(folder / "benchmark" / run.method / "run" / "config.yml")})
+    return read_json(kept, "delete it to judge the run again")
+
+
+def rendered_views(run: TrainedRun, count: int | None = None) -> Iterator[tuple[str, Tensor, dict[str, Any]]]:
+    """Held-out views, so many or all: the capture, its rendered spectra (h, w, bands), and the batch as measured."""
+    frames = run.manager.eval_dataset.metadata["frames"]
+    for camera, batch in HeldOutViews(run.manager.fixed_indices_eval_dataloader, count):
+        with torch.no_grad():
+            rendered = run.model.get_outputs_for_camera(camera)["spectral"].cpu()
+        yield frames[batch["image_idx"]].capture, rendered, batch
 
 
 def short_training(data: Path, folder: Path, iterations: int) -> list[object]:

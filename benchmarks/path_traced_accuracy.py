@@ -24,17 +24,16 @@ import trimesh
 import tyro
 from independent_session import BANDS, NODES_NM, IndependentSession, mixing_matrix
 from jaxtyping import Float
+from material_reflectance import spot_errors
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from open3d.core import Tensor
-from paper_tables import mean_and_deviation
+from paper_tables import mean_and_deviation, rendered_views
 from path_traced_scene import Fruit, PathTracedScene, camera_pose, material_reflectance, tarp_reflectance
 from results_table import RESULTS, write_results
 from session_mistakes import measured_errors
-from true_object import relative_rms
 
 from hsi_sc_nerf.analysis.report import each_object
-from hsi_sc_nerf.benchmark.run import HeldOutViews
 from hsi_sc_nerf.cli.workflows import RunCommand
 from hsi_sc_nerf.evaluation.spatial import Surface, sample_surface, score_at
 from hsi_sc_nerf.evaluation.spectral_metrics import spectral_metrics
@@ -70,7 +69,6 @@ TARP_BRIGHTNESS = 0.5
 """The tarp is brighter than this part of the image's 99th percentile; a session's white is its mean."""
 POINTS = 300_000
 FRONTAL_DEG = 65.0
-SPOTS, SPOT_RADIUS_M = 200, 0.005
 
 
 @dataclass(frozen=True)
@@ -181,13 +179,9 @@ class PathTracedAccuracy:
         Pixels count where the dataset's mask and more than half of the true coverage show the fruit.
         """
         coverage = np.load(self.session / "truth" / "masks.npz")
-        frames = run.manager.eval_dataset.metadata["frames"]
         bands = nearest_bands(BANDS, run.dataset.wavelengths_nm)
         found: dict[str, list[float]] = {}
-        for camera, batch in HeldOutViews(run.manager.fixed_indices_eval_dataloader, None):
-            with torch.no_grad():
-                rendered = run.model.get_outputs_for_camera(camera)["spectral"].cpu()
-            capture = frames[batch["image_idx"]].capture
+        for capture, rendered, batch in rendered_views(run):
             true = torch.from_numpy(self._noise_free(capture)[..., bands]).float()
             mask = batch["mask"][..., 0].bool() & torch.from_numpy(coverage[capture] > 0.5)
             for prefix, image in (("", rendered), ("noise: ", batch["spectral"])):
@@ -240,17 +234,15 @@ class PathTracedAccuracy:
         """Brightness of frontal points relative to the skin's, as measured and as the material's; spots of 10 mm."""
         frontal = np.flatnonzero(cloud.extra[INCIDENCE] < FRONTAL_DEG)
         cloud, corrected = cloud.select(frontal), material[frontal]
-        true, points = self._true_material(cloud), cloud.points
+        true = self._true_material(cloud)
         apparent, bright = (spectra.mean(axis=1) / true.mean(axis=1) for spectra in (cloud.spectra, corrected))
         names = ("as measured: 5 %", "50 %", "95 %", "material: 5 %", "median", "95 % of material")
         values = [*np.quantile(apparent, [0.05, 0.5, 0.95]), *np.quantile(bright, [0.05, 0.5, 0.95])]
-        centres = points[np.random.default_rng(0).choice(len(points), SPOTS, replace=False)]
-        near = (np.linalg.norm(points - centre, axis=1) < SPOT_RADIUS_M for centre in centres)
-        spots = [relative_rms(corrected[some].mean(axis=0), true[some].mean(axis=0)) for some in near]
+        spots = spot_errors(cloud.points, corrected, true)
         figures = dict(zip(names, map(float, values), strict=True))
         return figures | {
             "spots, %": 100.0 * float(np.median(spots)),
-            "worst spot, %": 100.0 * max(spots),
+            "worst spot, %": 100.0 * float(spots.max()),
         }
 
     def _draw(self, out: Path, path: Path) -> None:

@@ -34,7 +34,6 @@ RUN_STEPS = 10_000
 """Steps of the run over which those that are timed are spread: the stages' steps differ."""
 BLOCK_STEPS = 8
 """Steps that are timed in a row: as many as there are from one update of the occupancy grid to the next."""
-FLOAT_BYTES = 4
 CORNERS = 8
 COPIED_FLOATS = 2**25
 PRODUCT_SIDE = 1024
