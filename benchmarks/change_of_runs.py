@@ -22,7 +22,7 @@ import tyro
 from another_day import HEIGHT_M, STAND_M, Kind, SetDown, bruise_cm2, dried_materials, fruit_of, set_down
 from change_over_time import AGAIN, GROWN, MESH, NEAR_M, SESSION_SD, beside
 from jaxtyping import Bool, Float
-from results_table import RESULTS, write_results
+from results_table import Benchmark, write_results
 from rich.progress import track
 from scipy.spatial import cKDTree
 from true_object import TrueObject
@@ -60,7 +60,7 @@ AFTER_REPEAT = f"{REPEAT}, then second capture"
 
 
 @dataclass(frozen=True)
-class ChangeOfRuns:
+class ChangeOfRuns(Benchmark):
     """Train the runs, compare them, and write the table."""
 
     folder: tyro.conf.Positional[Path]
@@ -71,8 +71,6 @@ class ChangeOfRuns:
     height_m: float = HEIGHT_M
     days: tuple[str, ...] = tuple(DAYS)
     """Of `DAYS`, the first one among them; without "repeat", nothing is compared with --repeat."""
-    results: Path = RESULTS
-    """Folder of the CSV file."""
 
     def main(self) -> None:
         """Measure, print, write."""

@@ -19,7 +19,7 @@ from another_day import fruit_of
 from change_of_runs import DAYS, NM, REPEAT, SECOND, ChangeOfRuns, on_the_table
 from change_over_time import AGAIN, SESSION_SD, beside
 from jaxtyping import Float
-from results_table import RESULTS, write_results
+from results_table import Benchmark, write_results
 
 from hsi_sc_nerf.analysis.change_days import Day
 from hsi_sc_nerf.analysis.change_maps import BRIGHTNESS, Quantity, changes
@@ -37,15 +37,13 @@ INDICES = find_indices((), NM)
 
 
 @dataclass(frozen=True)
-class ChangeOfSpots:
+class ChangeOfSpots(Benchmark):
     """Paint, compare, and write the table."""
 
     folder: tyro.conf.Positional[Path]
     """That `change_of_runs.py` was given."""
     fruits: tuple[int, ...] = (7, 8, 9)
     """Seeds, each of another apple."""
-    results: Path = RESULTS
-    """Folder of the CSV file."""
 
     def main(self) -> None:
         """Measure, print, write."""

@@ -16,7 +16,7 @@ from typing import TypeAlias
 import numpy as np
 import tyro
 from another_day import CloudErrors, Kind, SetDown, bruise_cm2, cloud_of, fruit_of, set_down
-from results_table import RESULTS, write_results
+from results_table import Benchmark, write_results
 from rich.progress import track
 from scipy.spatial import cKDTree
 from true_object import TrueObject
@@ -80,13 +80,11 @@ SERIES: dict[Kind, list[Row]] = {
 
 
 @dataclass(frozen=True)
-class ChangeOverTime:
+class ChangeOverTime(Benchmark):
     """Simulate days, compare them, and write the table."""
 
     points: int = 40_000
     """Of each cloud, before what no camera sees is left out."""
-    results: Path = RESULTS
-    """Folder of the CSV file."""
     picture: Path | None = None
     """Draw nothing but a picture of the last apple of the table, to this file."""
 

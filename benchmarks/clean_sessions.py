@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
-from results_table import RESULTS, write_results
+from results_table import Benchmark, write_results
 from session_mistakes import findings_of_level, run_command
 
 from hsi_sc_nerf.capture.envi import open_cube, write_cube
@@ -42,15 +42,13 @@ REAL = Path(__file__).parents[1] / "tests" / "real_cubes" / "maize_kernel"
 
 
 @dataclass(frozen=True)
-class CleanSessions:
+class CleanSessions(Benchmark):
     """Simulate and check them, and write the table."""
 
     output_dir: Path
     """Folder for the sessions and datasets; sessions that are there are used again."""
     only: tuple[str, ...] = ()
     """Only these sessions, by name."""
-    results: Path = RESULTS
-    """Folder of the CSV file."""
 
     def main(self) -> None:
         """Do what is missing, print the table, write it."""

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 import tyro
 from jaxtyping import Float
-from results_table import RESULTS, write_results
+from results_table import Benchmark, write_results
 from rich.progress import track
 
 from hsi_sc_nerf.errors import InputError
@@ -119,15 +119,13 @@ COLUMNS = ["session", "size, px", "IoU, lowest", "IoU, median", "refused because
 
 
 @dataclass(frozen=True)
-class MaskCases:
+class MaskCases(Benchmark):
     """Measure foreground masks of simulated sessions."""
 
     scenes: tuple[str, ...] = (*SCENES, MIXED)
     """Sessions to measure; rows of the others are kept."""
     size_px: int = 128
     """Width and height of the frames, pixels."""
-    results: Path = RESULTS
-    """Folder of the CSV file."""
 
     def main(self) -> None:
         """Measure, print and write row by row."""

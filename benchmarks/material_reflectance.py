@@ -32,7 +32,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 from jaxtyping import Float, Int
-from results_table import RESULTS, write_results
+from results_table import Benchmark, write_results
 from true_object import TrueObject, relative_rms
 
 from hsi_sc_nerf.export.cloud import INCIDENCE, read_spectral_ply
@@ -84,7 +84,7 @@ PURE = 0.999
 
 
 @dataclass(frozen=True)
-class MaterialReflectance:
+class MaterialReflectance(Benchmark):
     """Separate light and material of a simulated session, and compare with the truth."""
 
     session: tyro.conf.Positional[Path]
@@ -99,8 +99,6 @@ class MaterialReflectance:
     """The cloud that was exported from it."""
     light: Path | None = None
     """NAME-material.json of another session, whose light is taken."""
-    results: Path = RESULTS
-    """Folder of the CSV file."""
 
     def main(self) -> None:
         """Measure, and write the table's row."""

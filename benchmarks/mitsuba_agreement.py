@@ -17,7 +17,7 @@ import mitsuba_rendering
 import numpy as np
 import tyro
 from jaxtyping import Bool, Float
-from results_table import RESULTS, write_results
+from results_table import Benchmark, write_results
 from rich.console import Console
 from rich.progress import track
 
@@ -151,7 +151,7 @@ def _weighted_mean(
 
 
 @dataclass(frozen=True)
-class MitsubaAgreement:
+class MitsubaAgreement(Benchmark):
     """Render one frame of a scene with our renderer and with Mitsuba 3 and compare them."""
 
     output_dir: Path
@@ -170,8 +170,6 @@ class MitsubaAgreement:
     """How many pictures Mitsuba makes of each; their scatter is the Monte-Carlo error."""
     supersampling: int = 16
     """Our rays along each side of a pixel."""
-    results: Path = RESULTS
-    """Folder of the CSV file."""
 
     def main(self) -> None:
         """Render, print the tables, draw the picture, write the results."""

@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 from another_day import CloudErrors, SetDown, cloud_of, set_down
 from matplotlib import rc_context
-from results_table import RESULTS, write_results
+from results_table import Benchmark, write_results
 from rich.progress import track
 from true_object import TrueObject
 
@@ -73,7 +73,7 @@ class Case:
 
 
 @dataclass(frozen=True)
-class OrganProposals:
+class OrganProposals(Benchmark):
     """Propose organs of simulated objects and compare them with their materials."""
 
     points: int = 50_000
@@ -85,8 +85,6 @@ class OrganProposals:
     trained: tuple[Path, ...] = ()
     """Folders of simulated sessions, runs of them and the clouds that these exported, whose rows are added: a row for
     all of one object, preset and size."""
-    results: Path = RESULTS
-    """Folder of the CSV file."""
     picture: Path | None = None
     """Draw nothing but a picture of objects with organs, to this file."""
 

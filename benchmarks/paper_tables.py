@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from results_table import RESULTS
+from results_table import Benchmark
 from torch import Tensor
 
 from hsi_sc_nerf.benchmark.configurations import Configuration
@@ -29,7 +29,7 @@ METRICS = {"sam": ("SAM, rad", 4), "rmse": ("RMSE", 4), "ssim": ("SSIM", 3), "ps
 
 
 @dataclass(frozen=True)
-class PaperTable:
+class PaperTable(Benchmark):
     """Options of a benchmark that trains on simulated objects. What is finished is not done again."""
 
     output_dir: Path
@@ -52,8 +52,6 @@ class PaperTable:
     """Width and height of the images, pixels."""
     bands: int = 204
     """Spectral bands."""
-    results: Path = RESULTS
-    """Folder of the CSV file."""
 
     def simulated(
         self,

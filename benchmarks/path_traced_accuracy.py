@@ -30,7 +30,7 @@ from matplotlib.figure import Figure
 from open3d.core import Tensor
 from paper_tables import mean_and_deviation, rendered_views
 from path_traced_scene import Fruit, PathTracedScene, camera_pose, material_reflectance, tarp_reflectance
-from results_table import RESULTS, write_results
+from results_table import Benchmark, write_results
 from session_mistakes import measured_errors
 
 from hsi_sc_nerf.analysis.report import each_object
@@ -72,7 +72,7 @@ FRONTAL_DEG = 65.0
 
 
 @dataclass(frozen=True)
-class PathTracedAccuracy:
+class PathTracedAccuracy(Benchmark):
     """Render a session, run on it, judge the results."""
 
     output_dir: Path
@@ -91,8 +91,6 @@ class PathTracedAccuracy:
     """Of the training."""
     words: str = ""
     """More words for the training; they are part of the row's name."""
-    results: Path = RESULTS
-    """Folder of the CSV file."""
     picture: Path | None = None
     """Where to draw the first seed's cloud: its brightness relative to the skin's, its height above the surface."""
 

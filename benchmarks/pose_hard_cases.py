@@ -13,13 +13,12 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import tyro
 from jaxtyping import Float, UInt8
-from results_table import RESULTS, write_results
+from results_table import Benchmark, write_results
 from scipy.spatial.transform import Rotation
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
@@ -246,15 +245,13 @@ def known_info(simulation: Simulation) -> SessionInfo:
 
 
 @dataclass(frozen=True)
-class PoseHardCases:
+class PoseHardCases(Benchmark):
     """Measure poses in hard cases."""
 
     size: int = 512
     """Width and height of the images, pixels; some cases take a fraction of it."""
     cases: tuple[str, ...] = ()
     """Which cases; all if not given."""
-    results: Path = RESULTS
-    """Folder of the CSV file."""
 
     def main(self) -> None:
         """Measure, print the table, write it."""

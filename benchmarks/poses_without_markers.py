@@ -36,7 +36,7 @@ from path_traced_scene import (
     stop_angles_deg,
 )
 from pose_hard_cases import Case, grey_images, known_info, pose_errors, scene_of
-from results_table import RESULTS, write_results
+from results_table import Benchmark, write_results
 from rich.progress import track
 
 from hsi_sc_nerf.capture.session_info import SessionInfo
@@ -148,7 +148,7 @@ def path_traced(field_of_view_deg: float, size_px: int, markers: bool) -> KnownS
 
 
 @dataclass(frozen=True)
-class PosesWithoutMarkers:
+class PosesWithoutMarkers(Benchmark):
     """Measure poses without markers."""
 
     folder: tyro.conf.Positional[Path]
@@ -157,8 +157,6 @@ class PosesWithoutMarkers:
     """Which objects."""
     size: int = 384
     """Width and height of the images, pixels."""
-    results: Path = RESULTS
-    """Folder of the CSV file."""
 
     def main(self) -> None:
         """Measure, print the table, write it."""

@@ -10,6 +10,7 @@ import os
 import platform
 import subprocess
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
@@ -19,6 +20,14 @@ from hsi_sc_nerf.terminal import screen_table
 
 RESULTS = Path(__file__).parent / "results"
 SOURCE_COLUMNS = ("commit", "seed", "machine")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Benchmark:
+    """The option of every benchmark that writes a table."""
+
+    results: Path = RESULTS
+    """Folder of the CSV file."""
 
 
 def write_results(

@@ -23,7 +23,7 @@ import numpy as np
 import tyro
 from mistakes import MISTAKES, WALL, Mistake, edit_headers, nothing, replaced_frames
 from odd_objects import ODD, odd_session
-from results_table import RESULTS, write_results
+from results_table import Benchmark, write_results
 from session_truth import SessionTruth
 
 from hsi_sc_nerf.geometry.camera import rotation_angle_deg
@@ -52,7 +52,7 @@ LONGEST_SENTENCE = 200
 
 
 @dataclass(frozen=True)
-class SessionMistakes:
+class SessionMistakes(Benchmark):
     """Make every mistake and write the table."""
 
     output_dir: Path
@@ -63,8 +63,6 @@ class SessionMistakes:
     """Which sessions."""
     only: tuple[str, ...] = ()
     """Only these mistakes, by name."""
-    results: Path = RESULTS
-    """Folder of the CSV file."""
 
     def main(self) -> None:
         """Do what is missing, print the table, write it."""

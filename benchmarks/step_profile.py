@@ -21,7 +21,7 @@ from typing import Any
 
 import torch
 import tyro
-from results_table import RESULTS, write_results
+from results_table import Benchmark, write_results
 from torch import nn
 
 from hsi_sc_nerf.benchmark.run import Job, build_trainer
@@ -78,7 +78,7 @@ class PartTimer:
 
 
 @dataclass(frozen=True)
-class StepProfile:
+class StepProfile(Benchmark):
     """Profile some steps of the default method and write the table."""
 
     data: tyro.conf.Positional[Path]
@@ -91,8 +91,6 @@ class StepProfile:
     """CPU threads."""
     label: str = "pear"
     """Name of the dataset in the table."""
-    results: Path = RESULTS
-    """Folder of the CSV file."""
 
     def main(self) -> None:
         """Measure and write."""

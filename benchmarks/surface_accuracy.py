@@ -21,7 +21,7 @@ import torch
 import tyro
 from jaxtyping import Float
 from open3d.core import Tensor
-from results_table import RESULTS, current_commit, write_results
+from results_table import Benchmark, current_commit, write_results
 
 import hsi_sc_nerf
 from hsi_sc_nerf.evaluation.comparison import CompareConfig, read_surface
@@ -54,7 +54,7 @@ COLUMNS = (
 
 
 @dataclass(frozen=True)
-class SurfaceAccuracy:
+class SurfaceAccuracy(Benchmark):
     """Measure the surface of a run's cloud against the truth."""
 
     session: tyro.conf.Positional[Path]
@@ -65,8 +65,6 @@ class SurfaceAccuracy:
     """Name of the row."""
     exact_depths: bool = False
     """Take the depths of the true mesh instead of the model's."""
-    results: Path = RESULTS
-    """Folder of the CSV file."""
 
     def main(self) -> None:
         """Export, measure, print the table, write the row."""

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 from paper_tables import short_training
-from results_table import RESULTS, write_results
+from results_table import Benchmark, write_results
 from traits_accuracy import EVERY_KTH_CAMERA, SPOTS, spots_on
 from true_object import TrueObject
 
@@ -47,7 +47,7 @@ COLUMNS = (
 
 
 @dataclass(frozen=True)
-class TraitUncertainty:
+class TraitUncertainty(Benchmark):
     """Options of the benchmark."""
 
     output_dir: tyro.conf.Positional[Path]
@@ -62,8 +62,6 @@ class TraitUncertainty:
     """Width and height of the images, pixels."""
     iterations: int = PRESETS["cpu"]["balanced"][ITERATIONS]
     """Training steps, of 1024 rays; those of `--preset balanced`, the default."""
-    results: Path = RESULTS
-    """Folder of the CSV file."""
 
     def main(self) -> None:
         """Measure all sessions, print the table, write it."""

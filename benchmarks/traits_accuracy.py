@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from results_table import RESULTS, write_results
+from results_table import Benchmark, write_results
 from rich.console import Console
 from true_object import TrueObject, relative_rms
 
@@ -53,7 +53,7 @@ LEFT_OUT = ("stem",)
 
 
 @dataclass(frozen=True)
-class TraitsAccuracy:
+class TraitsAccuracy(Benchmark):
     """Compare the traits of a cloud with the truth of the simulated session that it shows."""
 
     session: tyro.conf.Positional[Path]
@@ -68,8 +68,6 @@ class TraitsAccuracy:
     """Noise of the ideal cloud in each direction."""
     mesh: MeshConfig = field(default_factory=MeshConfig)
     """How the mesh is made."""
-    results: Path = RESULTS
-    """Folder of the CSV file."""
 
     def main(self) -> None:
         """Measure, print all figures, write the table's row."""

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 import tyro
-from results_table import RESULTS, write_results
+from results_table import Benchmark, write_results
 
 DIAMETERS_M, APART_M = (0.036, 0.026), 0.044
 MATERIAL = "tomato_red"
@@ -32,15 +32,13 @@ seed: 1
 
 
 @dataclass(frozen=True)
-class TwoBalls:
+class TwoBalls(Benchmark):
     """Simulate, run, compare, write the table."""
 
     output_dir: Path
     """Folder for session and results; what is there is used again."""
     preset: str = "fast"
     """Of the training."""
-    results: Path = RESULTS
-    """Folder of the CSV file."""
 
     def main(self) -> None:
         """Do what is missing, print the table, write it."""
