@@ -33,6 +33,8 @@ MATERIAL_NAME = "point_cloud-material.json"
 """File of the output folder that says what was decided of the light on the object."""
 OPTIONAL_STEPS = ("inspect", "material")
 """Where one of these fails, the others do without."""
+WORDED_STEPS = ("process", "train", "material", "traits")
+"""Those for which the settings of their names hold more words."""
 _DATASET_NAME = "transforms.json"
 """The file of a dataset that tells of its frames."""
 _ENVI = (".sli", ".hdr", "")
@@ -139,15 +141,12 @@ def session_steps(session: Path, out: Path, settings: SessionSettings, folder: P
         >>> [step.name for step in session_steps(Path("session"), Path("out"), SessionSettings())][:3]
         ['process', 'train', 'evaluate']
     """
-    named = {
-        name: _named_files(getattr(settings, name), folder) for name in ("process", "train", "material", "traits")
-    }
     data, cloud, traits = out / "data", out / "point_cloud.ply", out / "traits"
     material = out / "point_cloud-material.ply"
     with_material = material if material.is_file() else cloud
     run = out / "training" / "hsi-sc-nerf" / "run"
     config, weights = run / "config.yml", run / "nerfstudio_models"
-    packed = data / _DATASET_NAME
+    packed, measured = data / _DATASET_NAME, traits / "traits.json"
     training = ["ns-train", "hsi-sc-nerf", "--data", data, "--output-dir", out, "--experiment-name", "training"]
     training += ["--timestamp", "run", "--vis", "tensorboard", "--preset", settings.preset]
     if settings.max_num_iterations is not None:
@@ -157,38 +156,26 @@ def session_steps(session: Path, out: Path, settings: SessionSettings, folder: P
     exporting += ["--num-points", settings.num_points]
     measuring = ["hsi-sc-nerf", "traits", with_material, "--data", data, "--output-dir", traits]
     reporting = ["hsi-sc-nerf", "report", run, "--output", out / "report.html", "--cloud", cloud]
-    table: list[tuple[str, list[Any], tuple[Path, ...], tuple[Path, ...]]] = [
-        (
-            "process",
-            ["hsi-sc-nerf", "process", session, "--output-dir", data, *split_words(settings.process)],
-            (session, *named["process"]),
-            (packed,),
-        ),
-        ("train", [*training, *split_words(settings.train)], (packed, data / "masks", *named["train"]), (config,)),
-        ("evaluate", evaluating, (packed, weights), (out / "eval.json",)),
-        ("export", exporting, (packed, weights), (cloud,)),
-        (
-            "material",
-            ["hsi-sc-nerf", "material", cloud, "--load-config", config, *split_words(settings.material)],
-            (packed, weights, cloud, *named["material"]),
-            (material, out / MATERIAL_NAME),
-        ),
-        (
-            "traits",
-            [*measuring, *split_words(settings.traits)],
-            (packed, with_material, *named["traits"]),
-            (traits / "traits.json",),
-        ),
-        (
-            "report",
-            [*reporting, "--traits", traits / "traits.json"],
-            (packed, weights, cloud, traits / "traits.json"),
-            (out / "report.html",),
-        ),
-    ]
+    reporting += ["--traits", measured]
+
+    def step(name: str, words: list[Any], inputs: tuple[Path, ...], *outputs: Path) -> Step:
+        own = getattr(settings, name) if name in WORDED_STEPS else ""
+        typed = (word if isinstance(word, Path) else str(word) for word in (*words, *split_words(own)))
+        return Step(name, tuple(typed), (*inputs, *_named_files(own, folder)), outputs)
+
     return [
-        Step(name, tuple(word if isinstance(word, Path) else str(word) for word in words), inputs, outputs)
-        for name, words, inputs, outputs in table
+        step("process", ["hsi-sc-nerf", "process", session, "--output-dir", data], (session,), packed),
+        step("train", training, (packed, data / "masks"), config),
+        step("evaluate", evaluating, (packed, weights), out / "eval.json"),
+        step("export", exporting, (packed, weights), cloud),
+        step(
+            "material",
+            ["hsi-sc-nerf", "material", cloud, "--load-config", config],
+            (packed, weights, cloud),
+            *(material, out / MATERIAL_NAME),
+        ),
+        step("traits", measuring, (packed, with_material), measured),
+        step("report", reporting, (packed, weights, cloud, measured), out / "report.html"),
     ]
 
 

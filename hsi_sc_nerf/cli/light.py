@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 UNCERTAIN = 0.05
 """Irradiance that is more uncertain than this, relative to it, is warned of."""
-
-
 OTHER_LIGHT = 0.1
 """A taken light is warned of if brightness changes from view to view by more or less than this, relative to what the
 light says. A lamp of another place or strength gives 0.12 and more, the right one 0.01 (docs/validation/light.md)."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from importlib import import_module
-from typing import Annotated, Any, NamedTuple, Union
+from typing import Annotated, Any, Union
 
 from hsi_sc_nerf import interruption
 
@@ -13,34 +13,26 @@ _DESCRIPTION = "Hyperspectral 3D reconstruction of turntable captures."
 _GO_ON = ("ProcessCommand", "RunCommand", "BatchCommand")
 
 
-class Command(NamedTuple):
-    """Where a command is, and what the list of commands says of it."""
-
-    module: str
-    class_name: str
-    summary: str
-
-
 COMMANDS = {
-    "demo": Command("workflows", "DemoCommand", "Simulate, reconstruct and judge a fruit: try this first."),
-    "simulate": Command("sessions", "SimulateCommand", "Simulate a turntable session, with its truth."),
-    "run": Command("workflows", "RunCommand", "Do all steps from a capture session to traits and a report."),
-    "batch": Command("batch", "BatchCommand", "Do all steps on many sessions, here or on a cluster."),
-    "markers": Command("sessions", "MarkersCommand", "Write ArUco markers to print."),
-    "inspect": Command("sessions", "InspectCommand", "Check a session in seconds, before you process it."),
-    "process": Command("sessions", "ProcessCommand", "Calibrate captures, estimate poses and masks, pack a dataset."),
-    "export": Command("trained_runs", "ExportCommand", "Write the spectral point cloud of a trained run."),
-    "sample": Command("trained_runs", "SampleCommand", "Add spectra of a trained run to the points of a PLY file."),
-    "material": Command("light", "MaterialCommand", "Tell the material's reflectance apart from the light on it."),
-    "render": Command("trained_runs", "RenderCommand", "Render views of a trained run as ENVI cubes and videos."),
-    "compare": Command("clouds", "CompareCommand", "Compare a cloud or mesh with a reference: F-score, distances."),
-    "traits": Command("clouds", "TraitsCommand", "Measure sizes, spectra, indices and classes on a cloud."),
-    "change": Command("change", "ChangeCommand", "Find what changed on an object between days, beyond noise."),
-    "report": Command("trained_runs", "ReportCommand", "Write one HTML file on a trained run."),
-    "collect": Command("batch", "CollectCommand", "Write one table and one page of all objects of a batch."),
-    "benchmark": Command("benchmark", "BenchmarkCommand", "Compare configurations by accuracy over training time."),
+    "demo": ("workflows", "DemoCommand", "Simulate, reconstruct and judge a fruit: try this first."),
+    "simulate": ("sessions", "SimulateCommand", "Simulate a turntable session, with its truth."),
+    "run": ("workflows", "RunCommand", "Do all steps from a capture session to traits and a report."),
+    "batch": ("batch", "BatchCommand", "Do all steps on many sessions, here or on a cluster."),
+    "markers": ("sessions", "MarkersCommand", "Write ArUco markers to print."),
+    "inspect": ("sessions", "InspectCommand", "Check a session in seconds, before you process it."),
+    "process": ("sessions", "ProcessCommand", "Calibrate captures, estimate poses and masks, pack a dataset."),
+    "export": ("trained_runs", "ExportCommand", "Write the spectral point cloud of a trained run."),
+    "sample": ("trained_runs", "SampleCommand", "Add spectra of a trained run to the points of a PLY file."),
+    "material": ("light", "MaterialCommand", "Tell the material's reflectance apart from the light on it."),
+    "render": ("trained_runs", "RenderCommand", "Render views of a trained run as ENVI cubes and videos."),
+    "compare": ("clouds", "CompareCommand", "Compare a cloud or mesh with a reference: F-score, distances."),
+    "traits": ("clouds", "TraitsCommand", "Measure sizes, spectra, indices and classes on a cloud."),
+    "change": ("change", "ChangeCommand", "Find what changed on an object between days, beyond noise."),
+    "report": ("trained_runs", "ReportCommand", "Write one HTML file on a trained run."),
+    "collect": ("batch", "CollectCommand", "Write one table and one page of all objects of a batch."),
+    "benchmark": ("benchmark", "BenchmarkCommand", "Compare configurations by accuracy over training time."),
 }
-"""The commands, in the order in which the help lists them."""
+"""Module and class of each command and what the help says of it, in its order."""
 
 
 def main() -> None:
@@ -99,19 +91,20 @@ def named_commands(words: Sequence[str]) -> tuple[str, ...]:
     return tuple(word for word in words[:1] if word in COMMANDS)
 
 
-def _in_whole_lines(text: str) -> str:
-    return "\n\n".join(" ".join(paragraph.split()) for paragraph in text.split("\n\n"))
+def _in_whole_lines(helptext: str) -> str:
+    return "\n\n".join(" ".join(paragraph.split()) for paragraph in helptext.split("\n\n"))
 
 
 def _imported(name: str) -> type:
-    entry = COMMANDS[name]
-    return getattr(import_module(f"hsi_sc_nerf.cli.{entry.module}"), entry.class_name)
+    module, class_name, _ = COMMANDS[name]
+    return getattr(import_module(f"hsi_sc_nerf.cli.{module}"), class_name)
 
 
 def _listed(name: str) -> type:
     from dataclasses import make_dataclass
 
-    return make_dataclass(COMMANDS[name].class_name, [], namespace={"__doc__": COMMANDS[name].summary})
+    _, class_name, summary = COMMANDS[name]
+    return make_dataclass(class_name, [], namespace={"__doc__": summary})
 
 
 def _tell_error(error: BaseException) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import tyro
 
-from hsi_sc_nerf.batch.session_steps import SessionSettings, session_steps
+from hsi_sc_nerf.batch.session_steps import WORDED_STEPS, SessionSettings, session_steps
 from hsi_sc_nerf.benchmark.configurations import split_words
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.settings_file import check_options
@@ -32,7 +32,7 @@ def check_words(settings: SessionSettings, outs: Sequence[Path] = ()) -> None:
         InputError: a command does not take its words, a number lies outside its range, or words name a file that
             their own step replaces or another place for its results.
     """
-    for name in ("process", "train", "material", "traits"):
+    for name in WORDED_STEPS:
         for word in split_words(getattr(settings, name)):
             option = word.partition("=")[0].replace("_", "-")
             if option in _GIVEN:
