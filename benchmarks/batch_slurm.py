@@ -59,8 +59,6 @@ SwitchType=switch/none
 NodeName={host} NodeAddr=127.0.0.1 CPUs={cores} RealMemory={memory_mb} State=UNKNOWN
 PartitionName=lab Nodes=ALL Default=YES MaxTime=INFINITE State=UP
 """
-
-
 # Not SLURM_CONF: the jobs of Snakemake's plugin have no variables of SLURM's own.
 CONFIGURATION_PATH = Path("/etc/slurm/slurm.conf")
 MARK = "HSI_SC_NERF_CLUSTER"

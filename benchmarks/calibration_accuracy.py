@@ -201,13 +201,14 @@ def _drift_cells(drifts: Sequence[Drift]) -> list[str]:
     error = np.stack([drift.factor / true - 1.0 for drift, true in found])
     stated = np.stack([drift.standard_error / true for drift, true in found])
     ratio = np.abs(error[:, 1:] / stated[:, 1:])
-    percent = (_rms(error), np.sqrt(np.square(error).mean(axis=(0, 1))).max(), np.abs(error).max())
+    percent = (rms(error), np.sqrt(np.square(error).mean(axis=(0, 1))).max(), np.abs(error).max())
     within = [f"{100.0 * (ratio <= sigmas).mean():.0f}" for sigmas in (1.0, 2.0)]
     pixels = np.mean([drift.static.sum() for drift, _ in found])
-    return [f"{pixels:.0f}", *(f"{100.0 * value:.3f}" for value in percent), f"{_rms(ratio):.2f}", *within]
+    return [f"{pixels:.0f}", *(f"{100.0 * value:.3f}" for value in percent), f"{rms(ratio):.2f}", *within]
 
 
-def _rms(values: Float[np.ndarray, "*shape"]) -> float:
+def rms(values: Float[np.ndarray, "*shape"]) -> float:
+    """Root mean square."""
     return float(np.sqrt(np.square(values).mean()))
 
 

@@ -12,12 +12,12 @@ the default size, freed at the end.
 from __future__ import annotations
 
 import contextlib
-import os
 import tempfile
 import threading
 from pathlib import Path
 
 import tyro
+from psutil import NoSuchProcess, Process
 from results_table import RESULTS, write_results
 
 from hsi_sc_nerf.benchmark.steps import run_step, typed_command
@@ -74,24 +74,14 @@ class AnonymousMemory:
 
     def _watch(self) -> None:
         while not self._ended.wait(SAMPLED_EVERY_S):
-            self.peak_mib = max(self.peak_mib, sum(map(_anonymous_kib, _descendants(os.getpid()))) / 1024.0)
+            self.peak_mib = max(self.peak_mib, sum(map(_anonymous_mib, Process().children(recursive=True))))
 
 
-def _descendants(pid: int) -> list[int]:
-    found: list[int] = []
-    with contextlib.suppress(OSError):  # processes end
-        for children in Path(f"/proc/{pid}/task").glob("*/children"):
-            for child in map(int, children.read_text().split()):
-                found += [child, *_descendants(child)]
-    return found
-
-
-def _anonymous_kib(pid: int) -> int:
-    with contextlib.suppress(OSError):
-        for line in Path(f"/proc/{pid}/status").read_text().splitlines():
-            if line.startswith("RssAnon"):
-                return int(line.split()[1])
-    return 0
+def _anonymous_mib(process: Process) -> float:
+    with contextlib.suppress(NoSuchProcess):
+        memory = process.memory_info()
+        return (memory.rss - memory.shared) / 2**20
+    return 0.0
 
 
 def main(

@@ -16,6 +16,7 @@ import matplotlib
 import mitsuba_rendering
 import numpy as np
 import tyro
+from calibration_accuracy import rms
 from jaxtyping import Bool, Float
 from results_table import Benchmark, write_results
 from rich.console import Console
@@ -103,7 +104,7 @@ def render_ours(scene: Scene, frame: int) -> Ours:
     other_grid = (plain.frame(frame).material_weights - weights) @ simulation.endmembers
     if scene.effects:
         radiance += weights[..., -1:] * (1.0 - simulation.endmembers[-1])
-    ray_grid = _rms(other_grid[weights[..., -1] < 1.0]) / np.sqrt(2.0)
+    ray_grid = rms(other_grid[weights[..., -1] < 1.0]) / np.sqrt(2.0)
     of_object = np.isin(simulation.materials, simulation.object_part.materials)
     return Ours(radiance, weights, simulation.materials, of_object, ray_grid)
 
@@ -123,8 +124,8 @@ def compare(
     return Agreement(
         ours=ours.radiance,
         mitsuba=renders.mean(axis=0),
-        rms=_rms(difference.mean(axis=0)[seen]),
-        monte_carlo=_rms(renders.std(axis=0, ddof=1)[seen]) / np.sqrt(repeats),
+        rms=rms(difference.mean(axis=0)[seen]),
+        monte_carlo=rms(renders.std(axis=0, ddof=1)[seen]) / np.sqrt(repeats),
         ray_grid=ours.ray_grid,
         bias=_weighted_mean(difference, seen.astype(float)),
         bias_of_object=_weighted_mean(difference, ours.weights[..., ours.of_object].sum(axis=-1)),
@@ -134,10 +135,6 @@ def compare(
             if ours.weights[..., i].any()
         },
     )
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def _weighted_mean(

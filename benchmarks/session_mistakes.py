@@ -94,13 +94,13 @@ class SessionMistakes(Benchmark):
                 write_results("session_mistakes", COLUMNS, [row], keys=2, folder=self.results)
 
     def _path_traced(self) -> tuple[Path, Path]:
-        script = str(Path(__file__).with_name("independent_session.py"))
+        from independent_session import IndependentSession  # needs Mitsuba
+
         session, other = self.independent or self.output_dir / "path-traced", self.output_dir / "path-traced-other"
         if not (session / "truth").is_dir():
-            subprocess.run([sys.executable, script, str(session)], check=True)
+            IndependentSession(session).main()
         if not (other / "truth").is_dir():
-            words = [str(other), "--frames", "2", "--fruit", "long", "--seed", "1"]
-            subprocess.run([sys.executable, script, *words], check=True)
+            IndependentSession(other, frames=2, fruit="long", seed=1).main()
         return session, other
 
     def _simulated(self, name: str, effects: tuple[str, ...] = ()) -> tuple[Path, Path]:

@@ -6,8 +6,6 @@ uv run python benchmarks/two_balls.py --output-dir OUT
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,8 +14,13 @@ import trimesh
 import tyro
 from results_table import Benchmark, write_results
 
+from hsi_sc_nerf.cli.sessions import SimulateCommand
+from hsi_sc_nerf.cli.workflows import RunCommand
+from hsi_sc_nerf.models.presets import Preset
+
 DIAMETERS_M, APART_M = (0.036, 0.026), 0.044
 MATERIAL = "tomato_red"
+_LENGTHS = ("height", "largest_diameter")
 EFFECTS = ("photon_noise", "read_noise", "dark_pattern")
 COLUMNS = ("object", "true volume, mL", "volume, mL", "volume, error", "height, error", "largest diameter, error")
 SCENE = """
@@ -37,7 +40,7 @@ class TwoBalls(Benchmark):
 
     output_dir: Path
     """Folder for session and results; what is there is used again."""
-    preset: str = "fast"
+    preset: Preset = "fast"
     """Of the training."""
 
     def main(self) -> None:
@@ -53,11 +56,11 @@ class TwoBalls(Benchmark):
             trimesh.util.concatenate(balls).export(out / "balls.ply")
             text = SCENE.format(material=MATERIAL, effects=", ".join(EFFECTS))
             (out / "balls.yaml").write_text(text, encoding="utf-8")
-            _command("simulate", str(out / "balls.yaml"), str(session))
+            SimulateCommand(str(out / "balls.yaml"), session).main()
         traits = run / "traits" / "traits.json"
         if not traits.is_file():
-            words = ["--preset", self.preset, "--process=--masks.pieces 2", "--num-points", "60000"]
-            _command("run", str(session), "--output-dir", str(run), *words, "--traits=--splits 0")
+            words = {"process": "--masks.pieces 2", "traits": "--splits 0"}
+            RunCommand(session, run, preset=self.preset, num_points=60_000, **words).main()
         found = json.loads(traits.read_text(encoding="utf-8"))["pieces"]
         rows = []
         for diameter_m, one in zip(DIAMETERS_M, found, strict=True):
@@ -67,13 +70,6 @@ class TwoBalls(Benchmark):
             name = f"ball of {1e3 * diameter_m:.0f} mm, {self.preset}"
             rows.append([name, f"{true_ml:.2f}", f"{1e3 * size['volume_l']:.2f}", *errors])
         write_results("two_balls", COLUMNS, rows, keys=1, folder=self.results)
-
-
-_LENGTHS = ("height", "largest_diameter")
-
-
-def _command(*words: str) -> None:
-    subprocess.run([sys.executable, "-m", "hsi_sc_nerf.cli.main", *words], check=True)
 
 
 if __name__ == "__main__":

@@ -4,8 +4,6 @@ import contextlib
 import inspect
 import json
 import shutil
-import socket
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -17,6 +15,7 @@ import pytest
 import small_trainer
 import torch
 import tyro
+from browser_pictures import viewer
 from nerfstudio.configs import external_methods
 
 from hsi_sc_nerf.models.trained_run import TrainedRun
@@ -175,7 +174,7 @@ def ns_train(tmp_path, monkeypatch):
     return called
 
 
-def page(address, told, server_ended=lambda: False):
+def page(address, told):
     """What a server says as soon as it says ``told``."""
     text = ""
     for _ in range(240):
@@ -183,29 +182,13 @@ def page(address, told, server_ended=lambda: False):
             text = urlopen(address, timeout=60).read().decode()
         if told in text:
             return text
-        if server_ended():
-            break
         time.sleep(1)
     pytest.fail(f"{address} does not say {told!r}: {text[:500]!r}")
 
 
 def test_viewer_opens_a_run(config_path):
-    with socket.socket() as free:
-        free.bind(("", 0))
-        port = free.getsockname()[1]
-    words = [
-        Path(sys.executable).with_name("ns-viewer"),
-        "--load-config",
-        config_path,
-        "--viewer.websocket-port",
-        port,
-    ]
-    viewer = subprocess.Popen(list(map(str, words)))
-    try:
-        page(f"http://localhost:{port}", "<title>", lambda: viewer.poll() is not None)
-    finally:
-        viewer.kill()
-        viewer.wait()
+    with viewer(config_path) as address:
+        page(address, "<title>")
 
 
 def test_viewer_of_no_run_is_one_sentence(tmp_path):
