@@ -11,7 +11,6 @@ from quick_steps import quick_run
 from hsi_sc_nerf.batch.plan import INSPECTION_NAME, STEPS, outdated, read_plan, write_plan
 from hsi_sc_nerf.batch.recorded_step import copy_record, record_step, runner_of
 from hsi_sc_nerf.batch.session_steps import STEPS_NAME, SessionSettings
-from hsi_sc_nerf.cli import sessions
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_json
 
@@ -42,11 +41,6 @@ def records(one):
 
 def forced(plan, retry=False):
     return [path.stem for path in outdated(plan, retry)]
-
-
-def test_the_inspection_has_its_name(planned):
-    one = planned()["pear"]
-    assert one.step("inspect").outputs == (one.folder / sessions.INSPECTION_NAME,)
 
 
 def test_words_of_a_row_come_after_those_of_the_batch(planned):
