@@ -104,7 +104,7 @@ def show_table(
         screen_table(["error", "value", "target"], errors, "Processing against the truth"),
         screen_table(["step", "seconds", "peak memory, MiB"], steps, "Cost"),
     )
-    console.print(f"Pictures, cloud and summary.json are in {escape(str(out))}.")
+    console.print(f"Pictures, cloud and summary.json are in {escape(str(out))}.", soft_wrap=True)
 
 
 def draw_pictures(out: Path) -> None:

@@ -68,7 +68,7 @@ class SimulateCommand:
         )
         written = simulate_session(scene, self.session)
         size_px, frames = scene.camera.size_px, len(load_truth(written).captures)
-        Console().print(
+        Console(soft_wrap=True).print(
             f"{escape(str(written))}: {frames} frames of {size_px} x {size_px} pixels x {scene.sensor.bands} bands; "
             f"truth in {escape(str(written / 'truth'))}."
         )
@@ -103,12 +103,11 @@ class MarkersCommand:
 
         sheets = marker_sheets(self.marker_side_m, self.marker_dictionary, range(self.count), self.paper)
         write_marker_sheets(self.output, sheets)
-        console = Console()
+        console = Console(soft_wrap=True)
         number = "1 sheet" if len(sheets) == 1 else f"{len(sheets)} sheets"
-        console.print(f"{escape(str(self.output))}: {self.count} markers on {number}.", soft_wrap=True)
+        console.print(f"{escape(str(self.output))}: {self.count} markers on {number}.")
         console.print(
-            f'Print at 100 %, measure the ruler, and give "marker_side_m": {self.marker_side_m:g} in session.json.',
-            soft_wrap=True,
+            f'Print at 100 %, measure the ruler, and give "marker_side_m": {self.marker_side_m:g} in session.json.'
         )
 
 
@@ -174,12 +173,13 @@ class InspectCommand:
         try:
             while True:
                 for line in watch.new_lines():
-                    console.print(escape(line), highlight=False)
+                    console.print(line, highlight=False, markup=False, soft_wrap=True)
                 time.sleep(POLL_S)
         except KeyboardInterrupt:
             flagged = f"look at {', '.join(watch.flagged)}" if watch.flagged else "nothing is wrong with them"
             waiting = f"; not complete: {', '.join(watch.incomplete)}" if watch.incomplete else ""
-            console.print(f"{len(watch.captures)} captures; {flagged}{waiting}.", highlight=False, markup=False)
+            told = f"{len(watch.captures)} captures; {flagged}{waiting}."
+            console.print(told, highlight=False, markup=False, soft_wrap=True)
 
 
 def show_findings(console: Console, inspection: Inspection) -> None:

@@ -120,7 +120,7 @@ class SampleCommand:
         added = None if material is None else material.at(points_m)
         rgb_bands, metric = run.model.rgb_bands, run.dataset.metric
         write_sampled_ply(output, given, found, wavelengths_nm, rgb_bands, name, added, metric)
-        console = Console()
+        console = Console(soft_wrap=True)
         if no_spectrum:
             console.print(
                 f"[yellow]{no_spectrum:,} of {count:,} points have no spectrum (NaN): no training camera that "
@@ -236,7 +236,7 @@ class RenderCommand:
                     update(i + 1)
         legends = {path.name: item.legend for path, item in zip(files, shown, strict=True)}
         write_render_report(self.output_dir / "render", rows, legends)
-        Console().print(f"{len(views.names)} views: {escape(str(self.output_dir / 'render.md'))}")
+        Console(soft_wrap=True).print(f"{len(views.names)} views: {escape(str(self.output_dir / 'render.md'))}")
 
 
 @dataclass(frozen=True)

@@ -135,6 +135,13 @@ def test_a_disk_that_fills_up_in_process_is_one_line_and_leaves_nothing_half_wri
     assert not (out / "transforms.json").exists()
 
 
+def test_a_long_path_is_told_on_one_line(tmp_path, monkeypatch, capsys, command):
+    monkeypatch.setenv("COLUMNS", "60")
+    session = tmp_path / "a folder with a long name" / "of a session that was captured on Monday"
+    assert command("simulate", "sphere", session, "--frames", "3", "--size", "24", "--bands", "3") == 0
+    assert f"{session}: 3 frames" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(("name", "told"), [("run", "little without a GPU;"), ("material", "this one. The object")])
 def test_help_breaks_lines_where_the_terminal_ends_and_not_where_the_source_does(monkeypatch, capsys, name, told):
     monkeypatch.setenv("COLUMNS", "400")
