@@ -58,17 +58,8 @@ def write_valid_files(folder: Path) -> dict[str, Path]:
     some, box = np.full(bands, 0.5), np.array([[-0.1, -0.1, 0.0], [0.1, 0.1, 0.2]])
     write_transforms(
         PackedDataset(
-            *(
-                data,
-                truth.intrinsics,
-                np.zeros(4),
-                raw.wavelengths_nm,
-                raw.wavelengths_nm[[5, 3, 1]],
-                "ball",
-                box,
-                box,
-            ),
-            *(some, Container(0.09, 0.07), tuple(frames)),
+            *(data, truth.intrinsics, np.zeros(4), raw.wavelengths_nm, raw.wavelengths_nm[[5, 3, 1]], "ball"),
+            *(box, box, some, Container(0.09, 0.07), tuple(frames)),
             fwhm_nm=some,
             uncertainty=ReflectanceUncertainty(some, some, some),
             typical_uncertainty=some,

@@ -23,11 +23,7 @@ from hsi_sc_nerf.benchmark.configurations import (
     training_config,
 )
 from hsi_sc_nerf.benchmark.results import table, write_csv
-from hsi_sc_nerf.benchmark.run import (
-    BenchmarkRun,
-    Checkpoint,
-    HeldOutViews,
-)
+from hsi_sc_nerf.benchmark.run import BenchmarkRun, Checkpoint, HeldOutViews
 from hsi_sc_nerf.benchmark.steps import SPINS, run_step
 from hsi_sc_nerf.cli import benchmark
 from hsi_sc_nerf.cli.benchmark import BenchmarkCommand
