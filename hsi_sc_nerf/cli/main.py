@@ -80,8 +80,10 @@ def command_line(names: Sequence[str] = tuple(COMMANDS)) -> Any:
     """
     import tyro
 
-    # Of the docstrings of options, which are indented, it would keep the line breaks of the source.
-    tyro._strings.remove_single_line_breaks = _in_whole_lines
+    # Of the docstrings of options, which are indented, it would keep the line breaks of the source. The function is
+    # tyro's own: a version without it keeps them.
+    if (strings := getattr(tyro, "_strings", None)) is not None:
+        strings.remove_single_line_breaks = _in_whole_lines
     classes = {name: _imported(name) if name in names else _listed(name) for name in COMMANDS}
     return Union[tuple(Annotated[made, tyro.conf.subcommand(name)] for name, made in classes.items())]  # noqa: UP007
 

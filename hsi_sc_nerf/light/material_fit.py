@@ -147,7 +147,8 @@ class MaterialFitting:
     def bounce(self) -> None:
         """Irradiance at the measurements by other elements, from the light and materials of now."""
         frames, which = np.unique(self.views.frame, return_inverse=True)
-        direct = np.stack([self.elements.direct(self.light, int(frame)) for frame in frames], axis=1)
+        of_frames = (self.elements.direct(self.light, int(frame)).astype(np.float32) for frame in frames)
+        direct = np.stack([*of_frames], axis=1)
         for _ in range(1 if self.bounced.any() else 2):
             material = self.materials(self.irradiance())
             self.bounced = self.elements.bounced(direct, material)[self.views.element, which]
