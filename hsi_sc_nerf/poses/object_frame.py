@@ -18,8 +18,8 @@ from hsi_sc_nerf.poses.residuals import MarkerResiduals
 from hsi_sc_nerf.poses.result import ScaleSource
 from hsi_sc_nerf.poses.turntable import MarkerObservations, Turntable
 
-# A marker lies on the disc if it faces up to this cosine and its centre is this near the lowest such marker's,
-# in marker sides.
+# A marker lies on the disc if it faces up to this cosine and its centre is this near the lowest marker's, in marker
+# sides.
 _FACES_UP_COSINE = 0.97
 _COPLANAR_SIDES = 0.2
 # A marker stands upright if its normal leaves the horizontal by less than this sine, about 12 degrees.
@@ -44,7 +44,9 @@ def to_object_frame(turntable: Turntable, disc: float) -> Float[np.ndarray, "4 4
 
 
 def lie_on_disc(corners: Float[np.ndarray, "m 4 3"]) -> Bool[np.ndarray, "m"]:
-    """Which markers lie on the disc: the lowest group that faces up along z, the axis, and shares one height.
+    """Which markers lie on the disc: the lowest of all, where they face up along z, the axis, and share one height.
+
+    What faces up above others, as on the container's lid, does not lie on the disc.
 
     Args:
         corners: corners of each marker, in any unit, clockwise seen from its front.
@@ -56,7 +58,7 @@ def lie_on_disc(corners: Float[np.ndarray, "m 4 3"]) -> Bool[np.ndarray, "m"]:
         return up
     height = corners[..., 2].mean(axis=1)
     side = np.linalg.norm(right, axis=-1).mean()
-    return up & (height < height[up].min() + _COPLANAR_SIDES * side)
+    return up & (height < height.min() + _COPLANAR_SIDES * side)
 
 
 def disc_height(turntable: Turntable) -> float:

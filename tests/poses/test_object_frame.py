@@ -22,6 +22,11 @@ def turntable():
 
 def test_disc_is_the_lowest_group_that_faces_up(turntable):
     np.testing.assert_array_equal(lie_on_disc(turntable.corners()), turntable.markers >= 6)
+    on_lid = turntable.marker_poses.copy()
+    on_lid[-1, :3, 3] = [0.0, 0.0, on_lid[-1, 2, 3] + 0.07]
+    for kept, on_disc in ((slice(None), range(6, 13)), ([*range(6), 13], [])):  # with and without markers on the disc
+        poses = replace(turntable, markers=turntable.markers[kept], marker_poses=on_lid[kept])
+        assert poses.markers[lie_on_disc(poses.corners())].tolist() == [*on_disc]
 
 
 @pytest.mark.parametrize("shift_m", [0.0, 0.01])
