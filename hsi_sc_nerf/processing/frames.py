@@ -252,8 +252,8 @@ def session_fingerprint(session: Session, config: Any, files: Iterable[Path] = (
     """
     named = _stamps(session.path, [path for path in files if path.is_file()])
     settings = {name: value for name, value in asdict(config).items() if name not in _NOT_IN_RESULT}
-    # A damaged capture takes a place in the turn.
-    places = [session.places] if session.damaged else []
+    # What is left out takes a place in the turn, unless it is a copy.
+    places = [session.places] if session.damaged or session.excluded else []
     return fingerprint([session_files(session), settings, named, *places])
 
 

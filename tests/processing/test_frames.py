@@ -15,7 +15,7 @@ from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE, PixelFlag, unpack
 from hsi_sc_nerf.processing.foreground_score import smoothed_bins
-from hsi_sc_nerf.processing.frames import FramePaths, pack_frames, process_frame, read_cache
+from hsi_sc_nerf.processing.frames import FramePaths, pack_frames, process_frame, read_cache, session_fingerprint
 
 WAVELENGTHS_NM = np.array([440.0, 500.0, 550.0, 600.0, 650.0, 900.0])
 BANDS = len(WAVELENGTHS_NM)
@@ -169,3 +169,20 @@ def test_corrected_band_centres_reach_the_packed_cubes(tmp_path):
 
     assert packed_nm(450.0)[0] == 450.0
     assert packed_nm(500.0)[0] == 500.0
+
+
+def test_another_place_in_the_turn_is_another_dataset(tmp_path):
+    """A capture that is left out and a copy of another takes none."""
+
+    def write(name: str, level: int) -> None:
+        write_cube(tmp_path / name, np.full((4, 4, BANDS), level, np.uint16), wavelengths_nm=WAVELENGTHS_NM)
+
+    for number in range(4):
+        write(f"ball_{number}.hdr", number)
+    made = []
+    for level in (2, 1):
+        write("ball_2.hdr", level)
+        session = open_session(tmp_path, exclude=["ball_2"])
+        made.append((session.places, session_fingerprint(session, CalibrationConfig())))
+    assert [places for places, _ in made] == [(0, 1, 3), (0, 1, 2)]
+    assert made[0][1] != made[1][1]
