@@ -29,6 +29,7 @@ _FRAME_FILES = {
 }
 _AGAIN = "process the session again"
 _MAY_BE_UNKNOWN = ("fwhm_nm", "typical_uncertainty")
+_MAY_BE_MISSING = ("pose_method", "fingerprint", "image_rotation_deg", "origin_on_disc")
 _Array = TypeVar("_Array", bound=np.ndarray)
 _ROTATION_TOLERANCE = 1e-3  # of digits that somebody rounded
 
@@ -112,6 +113,9 @@ class PackedDataset:
         typical_uncertainty: standard deviation by band at the object's mean reflectance; None likewise.
         pose_method: how the poses were estimated ("markers", "colmap", "angles"); None if that is unknown.
         metric: whether lengths are metres; else nothing gave the scale: the camera's distance from the axis is 1.
+        image_rotation_deg: rotation of the raw images from upright, counter-clockwise; None in datasets of older
+            versions, and so is the next.
+        origin_on_disc: whether the object frame's origin is on the disc; else its height is not known.
         fingerprint: fingerprint of the session and the settings that the dataset was made from.
         effects: present in the session or not, by their evidence; empty in datasets of older versions.
     """
@@ -134,6 +138,8 @@ class PackedDataset:
     typical_uncertainty: Float[np.ndarray, "bands"] | None = None
     pose_method: str | None = None
     metric: bool = True
+    image_rotation_deg: int | None = None
+    origin_on_disc: bool | None = None
     fingerprint: str | None = None
     effects: tuple[EffectEvidence, ...] = ()
 
@@ -235,7 +241,7 @@ def write_transforms(dataset: PackedDataset) -> Path:
         if dataset.uncertainty is None
         else {name: values.tolist() for name, values in asdict(dataset.uncertainty).items()},
         **{name: None if array is None else array.tolist() for name, array in arrays.items()},
-        **{name: getattr(dataset, name) for name in ("flagged_values", "pose_method", "metric", "fingerprint")},
+        **{name: getattr(dataset, name) for name in ("flagged_values", "metric", *_MAY_BE_MISSING)},
         "effects": [asdict(effect) for effect in dataset.effects],
         "frames": [
             {
@@ -295,7 +301,7 @@ def _parse_transforms(root: Path, content: dict[str, Any], source: str) -> Packe
     for key in ("scene_box_m", "object_box_m"):
         if not (arrays[key][0] < arrays[key][1]).all():
             raise ValueError(f"{key} has no volume")
-    arrays |= {key: content.get(key) for key in ("pose_method", "fingerprint")}
+    arrays |= {key: content.get(key) for key in _MAY_BE_MISSING}
     parts = () if uncertainty is None else fields(ReflectanceUncertainty)
     terms: dict[str, Any] = {part.name: _numbers(uncertainty, part.name, (bands,)) for part in parts}
     return PackedDataset(

@@ -68,6 +68,8 @@ class KnownCamera:
     """Whether lengths are metres; otherwise the earlier session had no scale."""
     on_disc: bool = True
     """Whether the origin is on the disc."""
+    image_rotation_deg: int | None = None
+    """Rotation of the earlier session's raw images from upright, counter-clockwise; None if it is not known."""
 
     @property
     def distance_m(self) -> float | None:

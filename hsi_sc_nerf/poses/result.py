@@ -135,6 +135,11 @@ class TurntablePoses:
     """Where the size comes from; None where it is not known."""
     uncertainty: Uncertainty | None = None
 
+    @property
+    def on_disc(self) -> bool:
+        """Whether the origin is on the disc; else its height is not known."""
+        return bool(self.disc_markers) or self.disc_by_container
+
 
 def is_full_turn(angles_deg: np.ndarray) -> bool:
     """Whether unwrapped angles go round once, with the last frame a neighbour of the first."""

@@ -121,8 +121,7 @@ def posed_frames(output_dir: Path, poses: TurntablePoses) -> list[PackedFrame]:
 def container_under(session: Session, poses: TurntablePoses) -> Container | None:
     """The container, if its size is known and the object frame is in metres with the container on z = 0."""
     diameter_m, height_m = session.info.container_diameter_m, session.info.container_height_m
-    feet_known = bool(poses.disc_markers) or poses.disc_by_container
-    if diameter_m is None or height_m is None or not poses.metric or not feet_known:
+    if diameter_m is None or height_m is None or not poses.metric or not poses.on_disc:
         return None
     return Container(diameter_m, height_m)
 
@@ -133,11 +132,15 @@ def known_camera(earlier: PackedDataset) -> KnownCamera:
     k1, k2, p1, p2 = (float(c) for c in earlier.distortion)
     # The sign of the angles gives the direction, unless both signs occur.
     forward = {frame.angle_deg > 0.0 for frame in earlier.frames if frame.angle_deg != 0.0}
+    on_disc = earlier.origin_on_disc
+    if on_disc is None:
+        on_disc = earlier.container is not None or earlier.pose_method == "markers"
     return KnownCamera(
         intrinsics=earlier.intrinsics,
         distortion=(k1, k2, p1, p2),
         camera_to_world=turntable_camera_to_world(first.camera_to_world, -first.angle_deg),
         direction=None if len(forward) != 1 else "ccw" if True in forward else "cw",
         metric=earlier.metric,
-        on_disc=earlier.container is not None or earlier.pose_method == "markers",
+        on_disc=on_disc,
+        image_rotation_deg=earlier.image_rotation_deg,
     )

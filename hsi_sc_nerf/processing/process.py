@@ -100,7 +100,8 @@ def process_session(
 
     Raises:
         InputError: a setting is out of range; the session cannot be used (`open_session`, `calibrate_session`), has
-            no marker size, no poses or no object; or the output cannot be written or holds another kind of dataset.
+            no marker size, no poses, no object or images turned otherwise
+            than those of ``camera``; or the output cannot be written or holds another kind of dataset.
 
     Example:
         >>> data = process_session(Path("apple_01"), Path("apple_01-data"))
@@ -131,6 +132,12 @@ def process_session(
     info = replace(session.info, marker_side_m=config.marker_side_m or session.info.marker_side_m)
     scale_known = config.marker_side_m is not None or (camera is not None and camera.metric)
     session, checks = _inspect(session, config, scale_known, output_dir, console)
+    if camera is not None and camera.image_rotation_deg not in (None, session.image_rotation_deg):
+        raise InputError(
+            f"{session.path}: its images are turned by {session.image_rotation_deg} degrees from upright, those of "
+            f"{config.camera} by {camera.image_rotation_deg}; correct image_rotation_deg in session.json, or give a "
+            "dataset of the camera as it stands now."
+        )
     _remove_transforms(output_dir)
     checks.write()
 
@@ -192,6 +199,8 @@ def process_session(
         typical_uncertainty=typical,
         pose_method=poses.method,
         metric=poses.metric,
+        image_rotation_deg=session.image_rotation_deg,
+        origin_on_disc=poses.on_disc,
         fingerprint=fingerprint,
     )
     with console.status("measuring the effects in the session"):

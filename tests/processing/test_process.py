@@ -93,6 +93,14 @@ def test_the_dataset_that_gives_the_camera_is_not_replaced(processed):
 
 
 @pytest.mark.slow
+def test_a_camera_whose_images_were_turned_otherwise_is_refused(processed):
+    session, earlier = processed
+    (session / "session.json").write_text(json.dumps({**INFO, "image_rotation_deg": 90}))
+    with pytest.raises(InputError, match=r"by 90 degrees from upright, those of .* by 0"):
+        run(session, session.parent / "other", ProcessConfig(camera=earlier), poses=no_markers)
+
+
+@pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads the process's maps from /proc")
 def test_pictures_of_the_inspection_and_maps_of_frames_are_not_kept(session, tmp_path, monkeypatch):
     pictures, mapped = [], []
@@ -138,6 +146,7 @@ def test_session_to_dataset(processed):
     assert [frame.capture for frame in dataset.frames] == ["ball_1", "ball_2", "ball_3", "ball_4"]
     assert dataset.intrinsics == INTRINSICS
     assert dataset.container == Container(0.09, 0.07)
+    assert (dataset.image_rotation_deg, dataset.origin_on_disc) == (0, True)
     assert (dataset.object_name, dataset.pose_method) == ("ball", "markers")
     np.testing.assert_array_equal(dataset.wavelengths_nm, WAVELENGTHS_NM)
     np.testing.assert_allclose(dataset.background_reflectance, BACKGROUND, atol=2e-3)
@@ -255,7 +264,7 @@ def test_a_changed_earlier_camera_is_noticed(processed, tmp_path):
 def test_an_earlier_session_tells_how_the_table_turns(angles_deg, direction):
     frames = [SimpleNamespace(angle_deg=angle, camera_to_world=true_pose(angle)) for angle in angles_deg]
     for metric in (True, False):
-        for method, on_disc in (("markers", True), ("colmap", False)):
+        for method, stated, on_disc in (("markers", None, True), ("colmap", None, False), ("markers", False, False)):
             earlier = SimpleNamespace(
                 frames=frames,
                 intrinsics=INTRINSICS,
@@ -263,9 +272,12 @@ def test_an_earlier_session_tells_how_the_table_turns(angles_deg, direction):
                 metric=metric,
                 container=None,
                 pose_method=method,
+                origin_on_disc=stated,
+                image_rotation_deg=90,
             )
             camera = known_camera(earlier)
             assert (camera.direction, camera.metric, camera.on_disc) == (direction, metric, on_disc)
+            assert camera.image_rotation_deg == 90
     np.testing.assert_allclose(camera.camera_to_world, true_pose(0.0), atol=1e-12)
 
 
