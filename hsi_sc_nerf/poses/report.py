@@ -115,7 +115,8 @@ def _check_scale(poses: TurntablePoses) -> list[Finding]:
 
 def _check_distance(poses: TurntablePoses, info: SessionInfo) -> list[Finding]:
     """Whether the camera stands as far from the axis as is given, where something else gives the scale."""
-    if info.camera_distance_m is None or poses.scale is None or poses.scale.source == "distance":
+    by_distance = poses.scale is not None and poses.scale.source == "distance"
+    if info.camera_distance_m is None or not poses.metric or by_distance:
         return []
     found_m = float(np.linalg.norm(poses.camera_to_world[poses.used][0, :2, 3]))
     sigma = 0.0 if poses.uncertainty is None else poses.uncertainty.distance

@@ -90,6 +90,9 @@ def test_a_table_that_did_not_turn_for_a_capture_that_is_left_out(places, method
         (replace(GOOD, overall_error_px=1.2), STEPS, {"poses-error": "amber"}),
         (replace(GOOD, dropped={"a": "hidden"}), STEPS, {"poses-frames": "amber"}),
         (GOOD, replace(STEPS, direction="cw"), {"poses-direction": "red"}),
+        (GOOD, replace(STEPS, camera_distance_m=0.41), {}),
+        (GOOD, replace(STEPS, camera_distance_m=0.5), {"poses-scale": "red"}),  # an earlier dataset gives 0.4
+        (replace(GOOD, metric=False), replace(STEPS, camera_distance_m=0.5), {}),
         (GOOD, replace(STEPS, nominal_step_deg=80.0), {"poses-angles": "red"}),
         (replace(GOOD, angles_deg=np.array([0.0, 90, 210, 270])), STEPS, {"poses-angles": "amber"}),
         (GOOD, SessionInfo(frame_angles_deg=(5.0, 95.0, 185.0, 275.5)), {}),
