@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
@@ -76,14 +75,24 @@ def turntable_camera_to_world(
 
 
 def project(
-    points: Float[np.ndarray, "*n 3"], camera_to_world: Float[np.ndarray, "4 4"], intrinsics: PinholeIntrinsics
+    points: Float[np.ndarray, "*n 3"],
+    camera_to_world: Float[np.ndarray, "4 4"],
+    intrinsics: PinholeIntrinsics,
+    distortion: Float[np.ndarray, "4"] | tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
 ) -> tuple[Float[np.ndarray, "*n 2"], Float[np.ndarray, "*n"]]:
-    """Project object-frame points; returns pixel coordinates and the depth in front of the camera (metres)."""
+    """Project object-frame points through a lens with the distortion k1, k2, p1, p2 (OpenCV).
+
+    Returns:
+        Pixel coordinates, and the depth in front of the camera (metres).
+    """
     world_to_camera = np.linalg.inv(camera_to_world @ OPENCV_TO_OPENGL)
     in_camera = points @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
     depth = in_camera[..., 2]
+    plane, (k1, k2, p1, p2) = in_camera[..., :2] / depth[..., None], distortion
+    squared, tangential = (plane**2).sum(axis=-1, keepdims=True), np.array([p2, p1])
+    radial = 1.0 + squared * (k1 + squared * k2) + 2.0 * (plane @ tangential)[..., None]
     scale, centre = (intrinsics.fl_x, intrinsics.fl_y), (intrinsics.cx, intrinsics.cy)
-    return in_camera[..., :2] / depth[..., None] * scale + centre, depth
+    return (plane * radial + squared * tangential) * scale + centre, depth
 
 
 def pixels_of(
@@ -103,18 +112,6 @@ def image_of(
     image = np.zeros((intrinsics.h, intrinsics.w), bool)
     image[pixels[inside, 1], pixels[inside, 0]] = True
     return image
-
-
-def project_distorted(
-    points: Float[np.ndarray, "n 3"],
-    camera_to_world: Float[np.ndarray, "4 4"],
-    intrinsics: PinholeIntrinsics,
-    distortion: Float[np.ndarray, "4"],
-) -> Float[np.ndarray, "n 2"]:
-    """Pixel coordinates of object-frame points through a lens with the distortion k1, k2, p1, p2 (OpenCV)."""
-    to_camera = np.linalg.inv(camera_to_world @ OPENCV_TO_OPENGL)
-    in_camera = points @ to_camera[:3, :3].T + to_camera[:3, 3]
-    return cv2.projectPoints(in_camera, np.zeros(3), np.zeros(3), intrinsics.matrix(), distortion)[0][:, 0]
 
 
 def in_camera_frame(

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int, Num
 
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.capture.envi import open_cube
-from hsi_sc_nerf.geometry.camera import project_distorted
+from hsi_sc_nerf.geometry.camera import project
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.packed.cube import FLAGGED, REFLECTANCE_SCALE
 from hsi_sc_nerf.packed.dataset import PackedDataset, PackedFrame
@@ -85,7 +85,7 @@ def turntable_silhouette(
     """Pixels of a camera that show the turntable's disc or the container (`turntable_cylinders`)."""
     silhouette = np.zeros((dataset.intrinsics.h, dataset.intrinsics.w), np.uint8)
     for points in turntable_cylinders(dataset):
-        pixels = project_distorted(points, camera_to_world, dataset.intrinsics, dataset.distortion)
+        pixels, _ = project(points, camera_to_world, dataset.intrinsics, dataset.distortion)
         # OpenCV draws in coordinates whose origin is the first pixel's centre.
         cv2.fillConvexPoly(silhouette, cv2.convexHull(np.rint(pixels - 0.5).astype(np.int32)), 1)
     return silhouette > 0

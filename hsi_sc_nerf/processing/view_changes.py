@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project, project_distorted, unit_vectors
+from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, project, unit_vectors
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.processing.visual_hull import VotedHull
 
@@ -209,7 +209,7 @@ def point_views(
     found: list[tuple[np.ndarray, ...]] = []
     for frame in range(0, len(masks), -(-len(masks) // MAX_FRAMES)):
         pose = camera_to_worlds[frame]
-        pixels, depth = project_distorted(points, pose, intrinsics, distortion), project(points, pose, intrinsics)[1]
+        pixels, depth = project(points, pose, intrinsics, distortion)
         to_eye = pose[:3, 3] - points
         facing = (normals * to_eye).sum(axis=1) / np.linalg.norm(to_eye, axis=1)
         inside = ~dilate(~masks[frame], 2 * OUTLINE_PX + 1)

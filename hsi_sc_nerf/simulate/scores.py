@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from hsi_sc_nerf import paper
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.evaluation.comparison import CompareConfig, Reference, Track, surface_of, without_progress
-from hsi_sc_nerf.geometry.camera import project, project_distorted, rotation_angle_deg, unit_vectors
+from hsi_sc_nerf.geometry.camera import project, rotation_angle_deg, unit_vectors
 from hsi_sc_nerf.geometry.mesh import ray_scene, unoccluded
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.packed.dataset import PackedDataset
@@ -163,10 +163,7 @@ def _in_object_pixels(
     truth: Truth, capture: str, camera_to_world: Float[np.ndarray, "4 4"], points_m: Float[np.ndarray, "n 3"]
 ) -> Bool[np.ndarray, "n"]:
     coverage = truth.object_coverage(capture)
-    if not len(points_m):
-        return np.zeros(0, bool)
-    depth = project(points_m, camera_to_world, truth.intrinsics)[1]
-    pixels = project_distorted(points_m, camera_to_world, truth.intrinsics, np.array(truth.distortion))
+    pixels, depth = project(points_m, camera_to_world, truth.intrinsics, truth.distortion)
     columns, lines = np.floor(pixels).astype(int).T
     inside = (depth > 0) & (lines >= 0) & (lines < coverage.shape[0])
     inside &= (columns >= 0) & (columns < coverage.shape[1])

@@ -43,13 +43,15 @@ def test_look_at_straight_down_is_refused():
         look_at(np.array([0.0, 0.0, 1.0]), np.zeros(3))
 
 
-def test_projection_is_opencvs_half_a_pixel_further():
+@pytest.mark.parametrize("distortion", [(0.0, 0.0, 0.0, 0.0), (-0.3, 0.2, 0.01, -0.02)])
+def test_projection_is_opencvs_half_a_pixel_further(distortion):
     world_to_camera = np.linalg.inv(POSE @ OPENCV_TO_OPENGL)
     matrix = CAMERA.matrix()
     matrix[:2, 2] -= 0.5  # OpenCV's first pixel centre is (0, 0)
     rotation, _ = cv2.Rodrigues(world_to_camera[:3, :3])
-    theirs, _ = cv2.projectPoints(POINTS, rotation, world_to_camera[:3, 3], matrix, None)
-    np.testing.assert_allclose(project(POINTS, POSE, CAMERA)[0], theirs[:, 0] + 0.5, atol=1e-9)
+    theirs, _ = cv2.projectPoints(POINTS, rotation, world_to_camera[:3, 3], matrix, np.array(distortion))
+    np.testing.assert_allclose(project(POINTS, POSE, CAMERA, distortion)[0], theirs[:, 0] + 0.5, atol=1e-9)
+    assert project(POINTS[:0], POSE, CAMERA, distortion)[0].shape == (0, 2)
 
 
 def test_rays_go_through_the_points_that_were_projected():

@@ -9,7 +9,7 @@ from exact_turntable import marker_turntable, point_turntable
 from scipy.spatial.transform import Rotation
 from turntable_scene import MarkerScene
 
-from hsi_sc_nerf.geometry.camera import project_distorted
+from hsi_sc_nerf.geometry.camera import project
 from hsi_sc_nerf.poses.container_outline import container_outline, radius_by_camera
 
 RADIUS_M, HEIGHT_M, OVER = 0.045, 0.07, 8
@@ -31,7 +31,7 @@ def drawn(scene, shift_m, contrast, k1=0.0):
         around = np.linspace(0.0, 2.0 * np.pi, 90)
         rim = RADIUS_M * np.stack([np.cos(around), np.sin(around)], axis=-1) + [shift_m, 0.0]
         corners = np.concatenate([np.column_stack([rim, np.full(90, z)]) for z in np.linspace(0.0, HEIGHT_M, 8)])
-        pixels = project_distorted(corners, pose, scene.intrinsics, np.array([k1, 0.0, 0.0, 0.0]))
+        pixels, _ = project(corners, pose, scene.intrinsics, (k1, 0.0, 0.0, 0.0))
         hull = cv2.convexHull(np.float32(pixels * OVER)).astype(np.int32)
         covered = cv2.fillConvexPoly(np.zeros((192 * OVER, 192 * OVER), np.float32), hull, 1.0)
         covered = cv2.resize(covered, (192, 192), interpolation=cv2.INTER_AREA)

@@ -18,7 +18,7 @@ from hsi_sc_nerf.processing.view_changes import (
     colours_of,
     point_views,
 )
-from hsi_sc_nerf.processing.visual_hull import voted_hull
+from hsi_sc_nerf.processing.visual_hull import VotedHull, voted_hull
 
 FRAMES, CHANNELS = 24, 3
 NOISE = 0.02
@@ -143,6 +143,13 @@ def test_points_beside_the_mask_are_left_out(looked_up):
     _, found = looked_up
     number = np.bincount(found.frame)
     assert number[MISSING] < 0.6 * number[MISSING - 1]
+
+
+def test_a_hull_of_one_layer_has_no_points():
+    masks, poses = np.ones((3, LENS.h, LENS.w), bool), np.stack([true_pose(angle) for angle in (0.0, 90.0, 180.0)])
+    core = SPHERE_CENTRE_M + np.stack([*np.indices((9, 9)).reshape(2, -1), np.zeros(81)], axis=-1) * 1e-3
+    hull = VotedHull(core, np.full(3, 1e-3), 3, masks, masks)
+    assert len(point_views(np.ones((3, 2, LENS.h, LENS.w)), masks, poses, LENS, np.zeros(4), hull).point) == 0
 
 
 def test_colours_are_means_of_neighbouring_bins():
