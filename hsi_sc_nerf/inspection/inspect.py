@@ -26,7 +26,7 @@ from hsi_sc_nerf.inspection.marker_checks import Markers, check_markers, find_ma
 from hsi_sc_nerf.inspection.paper_check import check_paper
 from hsi_sc_nerf.inspection.quicklook import Quicklook, quicklooks_of
 from hsi_sc_nerf.plotting import COLOURS, STYLE, new_figure, save_figure, show_image
-from hsi_sc_nerf.poses.known_angles import are_assumed, known_angles_deg, required_angles_deg
+from hsi_sc_nerf.poses.known_angles import are_assumed, known_angles_deg
 from hsi_sc_nerf.poses.pose_methods import PoseMethod
 
 WHOLE_TURN_FRACTION = 0.05
@@ -203,7 +203,7 @@ def check_angles(session: Session, poses: PoseMethod, markers: Markers) -> list[
     info, places = session.info, session.places
     needed = poses == "angles" or (poses == "auto" and markers.dictionary is None)
     try:
-        (required_angles_deg if poses == "angles" else known_angles_deg)(info, places)
+        known_angles_deg(info, places, required=poses == "angles")
     except InputError as error:
         return [Finding("angles", "red" if needed else "amber", f"{session.info_path}: {error}.")]
     step, frames = info.nominal_step_deg, {frame.name for frame in session.frames}

@@ -19,7 +19,7 @@ from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, turntable_camera_to_world
 from hsi_sc_nerf.poses.bundle_adjustment import Adjusted, FreeParameters
 from hsi_sc_nerf.poses.container_outline import container_outline
-from hsi_sc_nerf.poses.known_angles import known_angles_deg, required_angles_deg
+from hsi_sc_nerf.poses.known_angles import known_angles_deg
 from hsi_sc_nerf.poses.marker_detection import find_dictionary
 from hsi_sc_nerf.poses.marker_observations import observe_markers
 from hsi_sc_nerf.poses.model_selection import usable
@@ -119,7 +119,8 @@ def poses_from_known_camera(
     camera.check_size(size_px)
     camera = camera.in_metres(info.camera_distance_m)
     direction, n = info.direction or camera.direction, len(names)
-    angles_deg = required_angles_deg(info, range(n) if places is None else places)
+    angles_deg = known_angles_deg(info, range(n) if places is None else places, required=True)
+    assert angles_deg is not None
     if direction is None:
         raise InputError(
             "which way the turntable turns is not known, neither from session.json nor from the angles of the "
@@ -176,7 +177,7 @@ def poses_from_sfm(
     if camera is not None:
         camera.check_size((width, height))
     places = range(len(names)) if places is None else places
-    angles_deg = (required_angles_deg if hold_angles else known_angles_deg)(info, places)
+    angles_deg = known_angles_deg(info, places, required=hold_angles)
     grays = SessionPictures.of(images).named(GRAY)
     if free is None:
         free = structure_from_motion(grays, names, focal_px=None if camera is None else camera.intrinsics.fl_x)

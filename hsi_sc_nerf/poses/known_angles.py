@@ -18,14 +18,17 @@ _STEP_TOLERANCE, _ANGLE_TOLERANCE = 0.05, 0.25
 _ANGLE_DEG = 1.0
 
 
-def known_angles_deg(info: SessionInfo, places: Sequence[int]) -> Float[np.ndarray, "n"] | None:
+def known_angles_deg(
+    info: SessionInfo, places: Sequence[int], required: bool = False
+) -> Float[np.ndarray, "n"] | None:
     """The frames' angles by ``session.json``, relative to the first; positive where the direction is not known.
 
     Args:
         places: each frame's place in the turn (`Session.places`), which counts captures that are left out.
+        required: whether they must be known.
 
     Raises:
-        InputError: not one angle per frame.
+        InputError: not one angle per frame, or none where they are required.
     """
     sign = -1.0 if info.direction == "cw" else 1.0
     if info.frame_angles_deg is not None:
@@ -34,21 +37,11 @@ def known_angles_deg(info: SessionInfo, places: Sequence[int]) -> Float[np.ndarr
                 f"{len(info.frame_angles_deg)} frame angles are given for {len(places)} frames; give one per frame"
             )
         return sign * _turned_deg(np.array(info.frame_angles_deg))
-    if info.nominal_step_deg is None:
-        return None
-    return sign * info.nominal_step_deg * (np.array(places) - places[0])
-
-
-def required_angles_deg(info: SessionInfo, places: Sequence[int]) -> Float[np.ndarray, "n"]:
-    """`known_angles_deg`, which must be known.
-
-    Raises:
-        InputError: they are not known, or not one angle per frame is given.
-    """
-    angles_deg = known_angles_deg(info, places)
-    if angles_deg is None:
+    if info.nominal_step_deg is not None:
+        return sign * info.nominal_step_deg * (np.array(places) - places[0])
+    if required:
         raise InputError("the angles are not known; give nominal_step_deg or frame_angles_deg in session.json")
-    return angles_deg
+    return None
 
 
 def are_assumed(info: SessionInfo, places: Sequence[int]) -> bool:
