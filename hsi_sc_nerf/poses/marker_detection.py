@@ -24,16 +24,9 @@ _MAGNIFICATIONS = (1, 2, 4, 8)
 
 # The largest dictionary of each family, then its smaller parts: a part holds the first ids of the family.
 _FAMILIES: dict[str, tuple[str, ...]] = {
-    "DICT_5X5_1000": ("DICT_5X5_50", "DICT_5X5_100", "DICT_5X5_250", "DICT_5X5_1000"),
-    "DICT_4X4_1000": ("DICT_4X4_50", "DICT_4X4_100", "DICT_4X4_250", "DICT_4X4_1000"),
-    "DICT_6X6_1000": ("DICT_6X6_50", "DICT_6X6_100", "DICT_6X6_250", "DICT_6X6_1000"),
-    "DICT_7X7_1000": ("DICT_7X7_50", "DICT_7X7_100", "DICT_7X7_250", "DICT_7X7_1000"),
-    "DICT_ARUCO_ORIGINAL": ("DICT_ARUCO_ORIGINAL",),
-    "DICT_ARUCO_MIP_36h12": ("DICT_ARUCO_MIP_36h12",),
-    "DICT_APRILTAG_36h11": ("DICT_APRILTAG_36h11",),
-    "DICT_APRILTAG_36h10": ("DICT_APRILTAG_36h10",),
-    "DICT_APRILTAG_25h9": ("DICT_APRILTAG_25h9",),
-    "DICT_APRILTAG_16h5": ("DICT_APRILTAG_16h5",),
+    **{f"DICT_{n}X{n}_1000": tuple(f"DICT_{n}X{n}_{ids}" for ids in (50, 100, 250, 1000)) for n in (5, 4, 6, 7)},
+    **{f"DICT_ARUCO_{name}": (f"DICT_ARUCO_{name}",) for name in ("ORIGINAL", "MIP_36h12")},
+    **{f"DICT_APRILTAG_{name}": (f"DICT_APRILTAG_{name}",) for name in ("36h11", "36h10", "25h9", "16h5")},
 }
 _FRAMES_FOR_DICTIONARY = 8
 # With this many of its markers in a frame, no other family needs to be tried.

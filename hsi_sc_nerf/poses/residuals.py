@@ -63,9 +63,9 @@ class Residuals(ABC):
     def scaled(self, pixels: Float[np.ndarray, "m 2 k"]) -> Float[np.ndarray, "n g*r k"]:
         """Displacements of the pixels in standard deviations."""
 
-    @abstractmethod
     def by_landmark(self, turntable: Turntable, by_point: Float[np.ndarray, "m 2 3"]) -> Float[np.ndarray, "m 2 d"]:
-        """Derivatives of the pixels by the landmark's parameters, from those by its points."""
+        """Derivatives of the pixels by the landmark's parameters: of a point its coordinates."""
+        return by_point
 
     @abstractmethod
     def moved(self, turntable: Turntable, step: Float[np.ndarray, "l d"]) -> Turntable:
@@ -146,10 +146,6 @@ class PointResiduals(Residuals):
     def scaled(self, pixels: Float[np.ndarray, "n 2 k"]) -> Float[np.ndarray, "n 2 k"]:
         """Displacements over the standard deviation."""
         return pixels / self.sigma_px
-
-    def by_landmark(self, turntable: Turntable, by_point: Float[np.ndarray, "n 2 3"]) -> Float[np.ndarray, "n 2 3"]:
-        """Derivatives by the point's coordinates."""
-        return by_point
 
     def curvature(self, turntable: Turntable) -> float:
         """Second derivatives of the losses over what ``weights`` takes for them, in the mean of all directions.

@@ -182,10 +182,6 @@ def _file_name(frame: int) -> str:
     return f"{frame:05d}.png"
 
 
-def _frame_of(file_name: str) -> int:
-    return int(Path(file_name).stem)
-
-
 def _match(folder: Path, frames: int, shape: tuple[int, ...], focal_px: float | None) -> None:
     """Features of all images, and those that neighbours in the turn share, into the folder's database."""
     import pycolmap
@@ -255,7 +251,7 @@ def _free_poses(reconstruction: pycolmap.Reconstruction, frames: int) -> FreePos
     for image in reconstruction.images.values():
         if not image.has_pose:
             continue
-        frame = _frame_of(image.name)
+        frame = int(Path(image.name).stem)
         poses[frame] = np.eye(4)
         poses[frame, :3] = image.cam_from_world().matrix()
         seen += [(frame, row[p.point3D_id], *p.xy) for p in image.points2D if p.has_point3D()]

@@ -84,10 +84,6 @@ class Tracks(_Observations):
     pixels: Float[np.ndarray, "n 2"]
 
 
-def _no_numbers() -> Int[np.ndarray, "0"]:
-    return np.zeros(0, int)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Turntable:
     """Camera, motion, and landmarks that turn with the object: square markers and points.
@@ -112,11 +108,11 @@ class Turntable:
     """Rotation vectors (x, y, 0; rad) and shifts (3) of a wobbling table; None for a table that does not wobble."""
     side: float = 1.0
     """Side of the markers' black square."""
-    markers: Int[np.ndarray, "m"] = field(default_factory=_no_numbers)
+    markers: Int[np.ndarray, "m"] = field(default_factory=lambda: np.zeros(0, int))
     """Ids, ascending."""
     marker_poses: Float[np.ndarray, "m 4 4"] = field(default_factory=lambda: np.zeros((0, 4, 4)))
     """Marker to object."""
-    points: Int[np.ndarray, "p"] = field(default_factory=_no_numbers)
+    points: Int[np.ndarray, "p"] = field(default_factory=lambda: np.zeros(0, int))
     """The tracks' numbers of the points, ascending."""
     points_3d: Float[np.ndarray, "p 3"] = field(default_factory=lambda: np.zeros((0, 3)))
 
@@ -165,7 +161,7 @@ class Turntable:
         """The turntable with only the frames and landmarks that are seen; angles keep their zero."""
         keep = np.isin(self.frames, np.concatenate([part.frame for part in seen]))
         numbers = [
-            np.concatenate([_no_numbers(), *(self._landmarks(s)[1] for s in seen if isinstance(s, kind))])
+            np.concatenate([np.zeros(0, int), *(self._landmarks(s)[1] for s in seen if isinstance(s, kind))])
             for kind in (MarkerObservations, Tracks)
         ]
         markers, points = np.isin(self.markers, numbers[0]), np.isin(self.points, numbers[1])

@@ -156,7 +156,7 @@ def _scatter(
     """Usual scatter of the channels between neighbouring points of successive frames; None with too few points."""
     found = []
     for first, second in pairs:
-        tree = _tree_of(views, first)
+        tree = cKDTree(views.positions_m[views.point[first]])
         change = _change(views, channels, tree, first, second, float(SLIPS_DEG[len(SLIPS_DEG) // 2 + 1]))
         if change is not None:
             found.append(median_abs_deviation(change, scale="normal"))
@@ -176,7 +176,7 @@ def slip_between(
     Returns:
         Degrees, counter-clockwise from above; and the difference that is left, over that without a slip.
     """
-    tree, differences = _tree_of(views, first), []
+    tree, differences = cKDTree(views.positions_m[views.point[first]]), []
     for slip_deg in SLIPS_DEG:
         change = _change(views, channels, tree, first, second, float(slip_deg))
         differences.append(np.inf if change is None else float(np.minimum(change**2, LARGEST_SIGMAS**2).mean()))
@@ -184,10 +184,6 @@ def slip_between(
     if not np.isfinite(differences[none]):
         return 0.0, 1.0
     return float(SLIPS_DEG[best]), differences[best] / max(differences[none], 1e-12)
-
-
-def _tree_of(views: PointViews, rows: np.ndarray) -> cKDTree:
-    return cKDTree(views.positions_m[views.point[rows]])
 
 
 def _change(
@@ -200,7 +196,7 @@ def _change(
 ) -> Float[np.ndarray, "k channels"] | None:
     """Change of the object's points from frame to frame, their median left out; None with too few points.
 
-    ``tree`` holds the points of the first frame (`_tree_of`).
+    ``tree`` holds the points of the first frame.
     """
     # What is now at a point was before at the point that the slip brings there.
     before = rotations_about_z(np.deg2rad([-slip_deg]))[0]

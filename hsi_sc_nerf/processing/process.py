@@ -15,14 +15,13 @@ from hsi_sc_nerf import paper
 from hsi_sc_nerf.calibration.calibration_checks import check_calibration, check_clipped
 from hsi_sc_nerf.calibration.reflectance import PixelCounts
 from hsi_sc_nerf.calibration.report import REPORT_NAME, describe_calibration, draw_calibration, write_calibration
-from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, SessionCalibration, calibrate_session
+from hsi_sc_nerf.calibration.session_calibration import CalibrationConfig, calibrate_session
 from hsi_sc_nerf.capture.session import Session, open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import require_writable
 from hsi_sc_nerf.inspection.inspect import inspect_session, suggestion
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.packed.dataset import (
-    TRANSFORMS_NAME,
     Container,
     PackedDataset,
     PackedFrame,
@@ -138,10 +137,17 @@ def process_session(
             f"{config.camera} by {camera.image_rotation_deg}; correct image_rotation_deg in session.json, or give a "
             "dataset of the camera as it stands now."
         )
-    _remove_transforms(output_dir)
+    transforms = transforms_path(output_dir)
+    if transforms.exists() and not is_packed(output_dir):
+        raise InputError(f"{transforms}: belongs to another kind of dataset; choose another output folder.")
+    transforms.unlink(missing_ok=True)  # its frames are about to change
     checks.write()
 
-    calibration = _calibrate(session, config, output_dir, console)
+    with console.status("measuring white, noise and lamps"):
+        calibration = calibrate_session(session, config.calibration)
+        draw_calibration(output_dir / "report", session, calibration, config.pseudo_rgb_nm)
+    for sentence in describe_calibration(session, calibration):
+        console.print(sentence, highlight=False)
     checks.add(check_calibration(session, calibration))
     caches = pack_frames(
         session,
@@ -244,29 +250,6 @@ def is_processed(session_dir: Path, output_dir: Path, config: ProcessConfig) -> 
 
 def _fingerprint(session: Session, config: ProcessConfig) -> str:
     return session_fingerprint(session, config, [] if config.camera is None else [transforms_path(config.camera)])
-
-
-def _remove_transforms(output_dir: Path) -> None:
-    """Delete an outdated ``transforms.json``, whose frames are about to change.
-
-    Raises:
-        InputError: it belongs to another kind of dataset.
-    """
-    transforms = output_dir / TRANSFORMS_NAME
-    if transforms.exists():
-        if not is_packed(output_dir):
-            raise InputError(f"{transforms}: belongs to another kind of dataset; choose another output folder.")
-        transforms.unlink()
-
-
-def _calibrate(session: Session, config: ProcessConfig, output_dir: Path, console: Console) -> SessionCalibration:
-    """Calibrate the session, draw the calibration's pictures and print what was found."""
-    with console.status("measuring white, noise and lamps"):
-        calibration = calibrate_session(session, config.calibration)
-        draw_calibration(output_dir / "report", session, calibration, config.pseudo_rgb_nm)
-    for sentence in describe_calibration(session, calibration):
-        console.print(sentence, highlight=False)
-    return calibration
 
 
 def _object_spectrum(

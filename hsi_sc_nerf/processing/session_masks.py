@@ -7,7 +7,6 @@ the side of that cylinder, wider ones are tried.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,19 +24,6 @@ from hsi_sc_nerf.processing.visual_hull import VotedHull, voted_hull
 
 OVERHANGS = (1.2, 1.6, 2.4)
 """Radii of the cylinder above the lid in which the object is searched for, as multiples of the lid's."""
-
-
-@dataclass(frozen=True, eq=False)
-class _FoundMasks:
-    masks: Bool[np.ndarray, "frames h w"]
-    hull: VotedHull
-    findings: list[Finding]
-
-    def cut_off(self) -> bool:
-        return any(finding.name == "masks-cut" for finding in self.findings)
-
-    def red(self) -> bool:
-        return any(finding.level == "red" for finding in self.findings)
 
 
 def write_masks(
@@ -75,7 +61,7 @@ def write_masks(
     def hull_of(masks: Bool[np.ndarray, "frames h w"]) -> VotedHull:
         return voted_hull(masks, camera_to_worlds, lens, None if container is None else container.height_m)
 
-    def found_within(overhang: float) -> _FoundMasks:
+    def found_within(overhang: float) -> tuple[Bool[np.ndarray, "frames h w"], VotedHull, list[Finding]]:
         regions = None
         if container is not None:
             distortion = np.array(poses.distortion, dtype=float)
@@ -92,23 +78,21 @@ def write_masks(
             regions,
             lid_middles,
         )
-        return _FoundMasks(masks, hull, findings)
+        return masks, hull, findings
 
-    def widened(found: _FoundMasks) -> _FoundMasks:
-        for overhang in OVERHANGS[1:]:
-            try:
-                wider = found_within(overhang)
-            except InputError:  # nothing stands out any more: the narrow space is the better one
-                break
-            if not wider.cut_off() and not wider.red():
-                return wider
-        return found
-
-    found = found_within(OVERHANGS[0] if config.overhang is None else config.overhang)
-    if config.overhang is None and found.cut_off():
-        found = widened(found)
-    masks = found.masks if found.red() else found.hull.trim(found.masks)
+    masks, hull, findings = found_within(OVERHANGS[0] if config.overhang is None else config.overhang)
+    is_cut_off = any(finding.name == "masks-cut" for finding in findings)
+    for overhang in OVERHANGS[1:] if config.overhang is None and is_cut_off else ():
+        try:
+            wider = found_within(overhang)
+        except InputError:  # nothing stands out any more: the narrow space is the better one
+            break
+        if not any(finding.name == "masks-cut" or finding.level == "red" for finding in wider[2]):
+            masks, hull, findings = wider
+            break
+    if not any(finding.level == "red" for finding in findings):
+        masks = hull.trim(masks)
     for frame, mask in zip(frames, masks, strict=True):
         write_png(frame.mask_path, mask.astype(np.uint8) * 255)
     mask_picture(report_dir / "masks.png", [frame.pseudo_rgb() for frame in frames], list(masks), names)
-    return masks, found.hull, found.findings
+    return masks, hull, findings
