@@ -84,7 +84,9 @@ def fit_marker(
     local = (np.stack([columns, rows], -1) + first + 0.5 - centre) / extent
     homography = _homography((corners_px - centre) / extent, cells)
     footprint = _footprint(corners_px, cells, blur_px, first, inside.shape, centre, extent)
-    texture = _texture(dictionary, marker, _texels_per_cell(corners_px, cells))
+    texels_per_cell = _TEXELS_PER_PX * np.sqrt(quad_area(corners_px)) / cells
+    nearest = min(_TEXELS_PER_CELL, key=lambda texels: abs(np.log(texels / texels_per_cell)))
+    texture = _texture(dictionary, marker, nearest)
     unit_corners = _unit_square(cells).astype(float)
     corners = corners_px
     linear = np.stack([np.ones(len(local)), local[:, 0], local[:, 1]], -1)
@@ -192,11 +194,6 @@ def _footprint(
         weight /= weight.sum(axis=1, keepdims=True)
         axes.append((((samples - middle) / extent).astype(np.float32), weight.astype(np.float32)))
     return axes
-
-
-def _texels_per_cell(corners_px, cells):
-    texels_per_cell = _TEXELS_PER_PX * np.sqrt(quad_area(corners_px)) / cells
-    return min(_TEXELS_PER_CELL, key=lambda texels: abs(np.log(texels / texels_per_cell)))
 
 
 @lru_cache(maxsize=64)

@@ -55,7 +55,11 @@ def poses_from_markers(
         >>> poses.camera_to_world.shape  # (frames, 4, 4), metres
     """
     require_frames(images, names)
-    _check_scale(info)
+    if info.marker_side_m is info.container_diameter_m is info.camera_distance_m is None:
+        raise InputError(
+            "nothing gives the scale; give marker_side_m, the side of the markers' black square in metres, or "
+            "container_diameter_m and container_height_m, or camera_distance_m"
+        )
     dictionary = info.marker_dictionary or find_dictionary(images)
     observed = observe_markers(images, dictionary) if dictionary else None
     if dictionary is None or observed is None or len(observed.observations) == 0:
@@ -115,14 +119,6 @@ def poses_from_markers(
         findings=tuple(found),
         outliers=tuple(rejected),
     )
-
-
-def _check_scale(info: SessionInfo) -> None:
-    if info.marker_side_m is info.container_diameter_m is info.camera_distance_m is None:
-        raise InputError(
-            "nothing gives the scale; give marker_side_m, the side of the markers' black square in metres, or "
-            "container_diameter_m and container_height_m, or camera_distance_m"
-        )
 
 
 def _dropped(names: Sequence[str], used: np.ndarray, rejected: Sequence[RejectedMarker]) -> dict[str, str]:

@@ -54,7 +54,10 @@ def marker_sheets(marker_side_m: float, dictionary: str, ids: Sequence[int], pap
         raise InputError(f"a marker of {side:g} mm does not fit on {paper} paper; make --marker-side-m smaller.")
     sheets: list[Figure] = []
     for start in range(0, len(ids), columns * rows):
-        figure, axes = _empty_sheet(width, height)
+        figure = Figure(figsize=(width / 25.4, height / 25.4), facecolor="white")
+        # In millimetres from the lower left corner.
+        axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0.0, width), ylim=(0.0, height))
+        axes.axis("off")
         top = height - _MARGIN_MM
         title = f'{dictionary}, black squares of {side:g} mm: "marker_side_m": {marker_side_m:g} in session.json'
         axes.text(_MARGIN_MM, top, title, va="top", size=10)
@@ -87,14 +90,6 @@ def write_marker_sheets(path: Path, sheets: Sequence[Figure]) -> None:
             pages.savefig(sheet)
     with atomic_write(path) as (temporary,):
         temporary.write_bytes(memory.getvalue())
-
-
-def _empty_sheet(width_mm: float, height_mm: float) -> tuple[Figure, Axes]:
-    """Axes in millimetres from the lower left corner of a sheet."""
-    figure = Figure(figsize=(width_mm / 25.4, height_mm / 25.4), facecolor="white")
-    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0.0, width_mm), ylim=(0.0, height_mm))
-    axes.axis("off")
-    return figure, axes
 
 
 def _draw_marker(axes: Axes, pattern: np.ndarray, left: float, upper: float, side: float) -> None:

@@ -212,12 +212,10 @@ def _match(folder: Path, frames: int, shape: tuple[int, ...], focal_px: float | 
     (folder / "pairs.txt").write_text("".join(f"{_file_name(i)} {_file_name(j)}\n" for i, j in pairs))
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = str(folder / "pairs.txt")
-    matching = pycolmap.FeatureMatchingOptions()
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = _SEED
     pycolmap.match_image_pairs(
         folder / "database.db",
-        matching_options=matching,
         pairing_options=pairing,
         verification_options=verification,
         device=pycolmap.Device.cpu,

@@ -68,11 +68,12 @@ def pose_frames(
     findings = check_poses(poses, info, session.places)
     report = pose_report(poses, info, findings, session.places)
     if pictures is not None:
+        of_frames = dict(zip(names, pictures.frames, strict=True))
         report["pictures"] = {
-            "best": {name: frame.ranking[0] for name, frame in zip(names, pictures.frames, strict=True)},
+            "best": {name: frame.ranking[0] for name, frame in of_frames.items()},
             "edge_precision_per_px": {
                 name: {picture: round(score, 1) for picture, score in frame.scores.items()}
-                for name, frame in zip(names, pictures.frames, strict=True)
+                for name, frame in of_frames.items()
             },
         }
     write_json(output_dir / "poses.json", report)

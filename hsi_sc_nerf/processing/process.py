@@ -22,7 +22,6 @@ from hsi_sc_nerf.files import require_writable
 from hsi_sc_nerf.inspection.inspect import inspect_session, suggestion
 from hsi_sc_nerf.packed.cube import unpack
 from hsi_sc_nerf.packed.dataset import (
-    Container,
     PackedDataset,
     PackedFrame,
     is_packed,
@@ -31,7 +30,6 @@ from hsi_sc_nerf.packed.dataset import (
     write_transforms,
 )
 from hsi_sc_nerf.poses.pose_methods import PoseMethod, find_poses
-from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.processing.appearance_checks import check_appearance, check_band_order
 from hsi_sc_nerf.processing.chamber import background_spectrum
 from hsi_sc_nerf.processing.effects import draw_effects, measure_effects, points_of_object, show_effects
@@ -41,7 +39,7 @@ from hsi_sc_nerf.processing.painted_masks import note_masks
 from hsi_sc_nerf.processing.posed_frames import PoseFunction, container_under, known_camera, pose_frames, posed_frames
 from hsi_sc_nerf.processing.session_checks import SessionChecks, require_checks
 from hsi_sc_nerf.processing.session_masks import write_masks
-from hsi_sc_nerf.processing.visual_hull import VotedHull, assumed_disc, object_box, scene_box, size_in_words
+from hsi_sc_nerf.processing.visual_hull import assumed_disc, object_box, scene_box, size_in_words
 from hsi_sc_nerf.settings_file import between, check_options
 from hsi_sc_nerf.spectra import nearest_bands
 
@@ -177,7 +175,11 @@ def process_session(
     masks, hull, findings = write_masks(caches, frames, poses, container, config.masks, output_dir / "report")
     console.print(f"Masks: the object covers {100.0 * masks.mean():.1f} % of the pixels.")
     checks.add(findings)
-    object_box_m, scene_box_m = _boxes(session, hull, poses, container, console)
+    object_box_m = object_box(hull, None if container is None else container.height_m)
+    console.print(f"Object: inside a box of {size_in_words(object_box_m, poses.metric)}.")
+    diameter_m = session.info.container_diameter_m if poses.metric else None
+    if assumption := assumed_disc(bool(poses.marker_corners_m), diameter_m):
+        console.print(f"Scene: {assumption}.", highlight=False)
     wavelengths_nm = session.wavelengths_nm[calibration.bands]
     spectrum, typical = _object_spectrum(frames, masks), None
     checks.add(check_band_order(spectrum, wavelengths_nm))
@@ -194,7 +196,7 @@ def process_session(
         fwhm_nm=None if widths_nm is None else widths_nm[calibration.bands],
         pseudo_rgb_nm=wavelengths_nm[nearest_bands(wavelengths_nm, config.pseudo_rgb_nm)],
         object_name=session.info.object or session.path.resolve().name,
-        scene_box_m=scene_box_m,
+        scene_box_m=scene_box(object_box_m, poses.marker_corners_m, container, diameter_m),
         object_box_m=object_box_m,
         background_reflectance=background_spectrum(frames, masks),
         container=container,
@@ -269,19 +271,3 @@ def _object_spectrum(
         total += reflectance.sum(axis=0) / np.maximum(measured, 1)
         number += measured > 0
     return total / np.maximum(number, 1)
-
-
-def _boxes(
-    session: Session,
-    hull: VotedHull,
-    poses: TurntablePoses,
-    container: Container | None,
-    console: Console,
-) -> tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "2 3"]]:
-    """The boxes of the object and of everything that turns; print what is assumed for them."""
-    object_box_m = object_box(hull, None if container is None else container.height_m)
-    console.print(f"Object: inside a box of {size_in_words(object_box_m, poses.metric)}.")
-    diameter_m = session.info.container_diameter_m if poses.metric else None
-    if assumption := assumed_disc(bool(poses.marker_corners_m), diameter_m):
-        console.print(f"Scene: {assumption}.", highlight=False)
-    return object_box_m, scene_box(object_box_m, poses.marker_corners_m, container, container_diameter_m=diameter_m)

@@ -85,7 +85,8 @@ def change_with_height(views: PointViews) -> Change:
     seen = np.unique(views.point)
     spectra = np.maximum(spectra[seen], 1e-4)
     brightness, alike = np.log(spectra.mean(axis=1)), like_spectra(spectra)
-    height, slope = (_tertile(values[seen]) for values in (views.positions_m[:, 2], views.normals[:, 2]))
+    of_points = views.positions_m[seen, 2], views.normals[seen, 2]
+    height, slope = (np.searchsorted(np.quantile(values, [1 / 3, 2 / 3]), values) for values in of_points)
     causes = _indicators(3 * height + slope)
     causes = causes - causes[alike].mean(axis=1)
     response = brightness - brightness[alike].mean(axis=1)
@@ -122,10 +123,6 @@ def mean_by_index(values: Float[np.ndarray, "n *k"], index: Int[np.ndarray, "n"]
 
 def _indicators(kind: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n kinds"]:
     return (kind[:, None] == np.unique(kind)).astype(float)
-
-
-def _tertile(values: Float[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
-    return np.searchsorted(np.quantile(values, [1 / 3, 2 / 3]), values)
 
 
 def _rows_of(sector: Int[np.ndarray, "n"]) -> list[np.ndarray]:
