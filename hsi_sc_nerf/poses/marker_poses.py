@@ -26,6 +26,10 @@ from hsi_sc_nerf.poses.turntable import FEWEST_FRAMES, require_parallax
 # Taken for the markers' side where only the container's diameter is known; any length would do.
 _SIDE_WITHOUT_SCALE_M = 0.03
 
+# Upright markers that are seen from about their own height do not tell which end of the axis is up: it is the upper
+# one in the pictures. They face away from the axis by this cosine, and the camera is level to this sine (5 degrees).
+_UPRIGHT_COSINE, _LEVEL_SINE = 0.5, 0.087
+
 
 def poses_from_markers(
     images: Sequence[UInt8[np.ndarray, "h w"]],
@@ -78,6 +82,10 @@ def poses_from_markers(
             f"markers with others, {FEWEST_FRAMES} are needed; {advice}"
         )
     start = initialise(linked, (width / 2, height / 2), width, info.marker_side_m or _SIDE_WITHOUT_SCALE_M)
+    right, down, forward = start.camera_rotation[:, 2]
+    none_is_flat = np.abs(start.marker_poses[:, 2, 2]).max() < _UPRIGHT_COSINE
+    if none_is_flat and abs(forward) < _LEVEL_SINE and down > abs(right):
+        start = start.turned_over()
     require_parallax(start.distance, np.linalg.norm(start.marker_poses[:, :3, 3] - [start.distance, 0, 0], axis=-1))
     first, _, outliers = adjust_without_outliers(start, linked)
     start = first.turntable

@@ -132,8 +132,9 @@ def test_full_turn_is_told_from_a_partial_one():
 
 
 @pytest.mark.slow
-def test_without_disc_markers_the_origin_is_the_lowest_corner_and_said_so():
-    scene, poses = estimated(size_px=160, frames=15, disc_markers=0)
+@pytest.mark.parametrize("elevation_deg", [17.0, -4.0])  # above the markers, and below their middle
+def test_without_disc_markers_the_origin_is_the_lowest_corner_and_said_so(elevation_deg):
+    scene, poses = estimated(size_px=160, frames=15, disc_markers=0, elevation_deg=elevation_deg)
     lowest = min(corners[:, 2].min() for corners in poses.marker_corners_m.values())
     assert lowest == pytest.approx(0.0, abs=1e-9)
     assert [finding.name for finding in poses.findings] == ["poses-origin"]
