@@ -243,7 +243,14 @@ def _posed(
     if scale_is_poor and diameter_m is not None and height_m is not None:
         grays = SessionPictures.of(images).named(GRAY)
         outline = container_outline(grays, adjusted.turntable, height_m / diameter_m)
-    if scale_of(adjusted.turntable, info, outline)[0] is None:
+    source, _ = scale_of(adjusted.turntable, info, outline)
+    if source == "distance" and camera is not None and info.camera_distance_m == camera.distance_m:
+        sentence = (
+            "The camera's distance from the axis in the earlier session gives the scale; if the camera was moved "
+            "since then, give camera_distance_m in session.json."
+        )
+        findings.append(Finding("poses-given", "amber", sentence))
+    if source is None:
         show = "show markers and give" if markers is None else "give"
         size = "" if diameter_m is not None else " or the container's size"
         findings.append(_no_scale(f"{show} marker_side_m, or give camera_distance_m{size}"))
