@@ -84,12 +84,19 @@ class KnownCamera:
         camera_to_world[:3, 3] *= distance_m / np.hypot(*camera_to_world[:2, 3])
         return replace(self, camera_to_world=camera_to_world, metric=True)
 
-    def check_size(self, size_px: tuple[int, int]) -> None:
-        """Refuse images of another width and height.
+    def check_images(self, size_px: tuple[int, int], info: SessionInfo) -> None:
+        """Refuse images of another width and height, or that were turned otherwise.
 
         Raises:
             InputError: they differ.
         """
+        turned_deg, earlier_deg = info.image_rotation_deg, self.image_rotation_deg
+        if turned_deg != earlier_deg and None not in (turned_deg, earlier_deg):
+            raise InputError(
+                f"the raw images are turned by {turned_deg} degrees from upright, those of the earlier session by "
+                f"{earlier_deg}; correct image_rotation_deg in session.json, or give a session of the camera as it "
+                "stands now"
+            )
         if size_px != (self.intrinsics.w, self.intrinsics.h):
             raise InputError(
                 f"the images have {size_px[0]} x {size_px[1]} pixels, but the camera of the earlier session had "
@@ -113,10 +120,10 @@ def poses_from_known_camera(
         places: each frame's place in the turn (`Session.places`); one after the other if not given.
 
     Raises:
-        InputError: images of another size than the camera's, unknown angles, or an unknown direction: the poses might
-            be mirrored.
+        InputError: images that are not the camera's (`KnownCamera.check_images`), unknown angles, or an unknown
+            direction: the poses might be mirrored.
     """
-    camera.check_size(size_px)
+    camera.check_images(size_px, info)
     camera = camera.in_metres(info.camera_distance_m)
     direction, n = info.direction or camera.direction, len(names)
     angles_deg = known_angles_deg(info, range(n) if places is None else places, required=True)
@@ -171,11 +178,11 @@ def poses_from_sfm(
 
     Raises:
         InputError: too little texture, poses that do not turn about one axis, unknown angles that should be held, or
-            images of another size than the earlier camera's.
+            images that are not the earlier camera's.
     """
     height, width = images[0].shape
     if camera is not None:
-        camera.check_size((width, height))
+        camera.check_images((width, height), info)
     places = range(len(names)) if places is None else places
     angles_deg = known_angles_deg(info, places, required=hold_angles)
     grays = SessionPictures.of(images).named(GRAY)

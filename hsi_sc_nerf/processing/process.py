@@ -97,8 +97,7 @@ def process_session(
 
     Raises:
         InputError: a setting is out of range; the session cannot be used (`open_session`, `calibrate_session`), has
-            no marker size, no poses, no object or images turned otherwise
-            than those of ``camera``; or the output cannot be written or holds another kind of dataset.
+            no marker size, no poses or no object; or the output cannot be written or holds another kind of dataset.
 
     Example:
         >>> data = process_session(Path("apple_01"), Path("apple_01-data"))
@@ -126,15 +125,10 @@ def process_session(
         console.print(f"{output_dir}: is up to date.")
         return output_dir
     camera = None if config.camera is None else known_camera(open_packed(config.camera))
-    info = replace(session.info, marker_side_m=config.marker_side_m or session.info.marker_side_m)
     scale_known = config.marker_side_m is not None or (camera is not None and camera.metric)
     session, checks = _inspect(session, config, scale_known, output_dir, console)
-    if camera is not None and camera.image_rotation_deg not in (None, session.image_rotation_deg):
-        raise InputError(
-            f"{session.path}: its images are turned by {session.image_rotation_deg} degrees from upright, those of "
-            f"{config.camera} by {camera.image_rotation_deg}; correct image_rotation_deg in session.json, or give a "
-            "dataset of the camera as it stands now."
-        )
+    side_m = config.marker_side_m or session.info.marker_side_m
+    info = replace(session.info, marker_side_m=side_m, image_rotation_deg=session.image_rotation_deg)
     transforms = transforms_path(output_dir)
     if transforms.exists() and not is_packed(output_dir):
         raise InputError(f"{transforms}: belongs to another kind of dataset; choose another output folder.")

@@ -164,11 +164,15 @@ def test_nominal_steps_count_captures_that_are_left_out():
         (SessionInfo(), "ccw", 48, "the angles are not known"),
         (SessionInfo(frame_angles_deg=(0.0, 1.0)), "ccw", 48, "2 frame angles"),
         (STEPS, None, 48, r"which way the turntable turns is not known.*give direction"),
+        (replace(STEPS, image_rotation_deg=90), "ccw", 48, "by 90 degrees from upright, those of .* by 270"),
         (STEPS, "ccw", 10, "64 x 10 pixels, but the camera of the earlier session had 64 x 48"),
     ],
 )
 def test_angles_that_do_not_do_with_a_camera_are_refused(info, direction, side_px, message):
-    images, camera = [image[:side_px] for image in BLANK], replace(CAMERA, direction=direction)
+    images, camera = (
+        [image[:side_px] for image in BLANK],
+        replace(CAMERA, direction=direction, image_rotation_deg=270),
+    )
     with pytest.raises(InputError, match=message):
         find_poses(images, list("abcd"), info, "angles", camera=camera)
 
