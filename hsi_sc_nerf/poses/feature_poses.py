@@ -243,7 +243,7 @@ def _posed(
     findings: list[Finding] = []
     if camera is not None:
         findings = check_camera(adjusted, found, camera)
-    errors_px, overall_px = turntable.frame_errors_px(found.tracks, n)
+    errors_px, overall_px = adjusted.turntable.frame_errors_px(found.tracks, n)
     height, width = images[0].shape
     outline, diameter_m, height_m = None, info.container_diameter_m, info.container_height_m
     scale_is_poor = scale_of(adjusted.turntable, info)[0] in (None, "distance")

@@ -131,6 +131,17 @@ def test_an_earlier_camera_keeps_its_distortion(session):
     assert [finding.name for finding in poses.findings] == ["poses-given", "poses-origin"]
 
 
+@pytest.mark.slow
+def test_the_stated_error_is_that_of_the_poses_which_a_wrong_camera_spoils(session):
+    scene, true, _ = session
+    true = points_alone(true)
+    alone, spoilt = (
+        by_features(true, point_tracks(true, noise_px=0.05), camera=camera)
+        for camera in (None, known_camera(scene, 1.3))
+    )
+    assert spoilt.overall_error_px > 3.0 * alone.overall_error_px
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_known_angles_are_trusted_as_far_as_they_are_even(session, sign):
     _, true, found = session
