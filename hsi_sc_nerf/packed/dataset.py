@@ -113,9 +113,8 @@ class PackedDataset:
         typical_uncertainty: standard deviation by band at the object's mean reflectance; None likewise.
         pose_method: how the poses were estimated ("markers", "colmap", "angles"); None if that is unknown.
         metric: whether lengths are metres; else nothing gave the scale: the camera's distance from the axis is 1.
-        image_rotation_deg: rotation of the raw images from upright, counter-clockwise; None in datasets of older
-            versions, and so is the next.
-        origin_on_disc: whether the object frame's origin is on the disc; else its height is not known.
+        image_rotation_deg: rotation of the raw images from upright, counter-clockwise; None in older datasets.
+        origin_on_disc: whether the origin is on the disc, else its height is not known; None in older datasets.
         fingerprint: fingerprint of the session and the settings that the dataset was made from.
         effects: present in the session or not, by their evidence; empty in datasets of older versions.
     """
@@ -169,10 +168,8 @@ class PackedDataset:
         stated = (self.intrinsics.h, self.intrinsics.w, len(self.wavelengths_nm))
         if values.shape != stated[: values.ndim]:
             found, expected = (" x ".join(map(str, size)) for size in (values.shape, stated))
-            raise InputError(
-                f"{path}: has {found} values, but the dataset's transforms.json states {expected} (lines, samples, "
-                f"bands); {_AGAIN}."
-            )
+            of = f"the dataset's transforms.json states {expected} (lines, samples, bands)"
+            raise InputError(f"{path}: has {found} values, but {of}; {_AGAIN}.")
         return values
 
     @property
@@ -230,16 +227,14 @@ def write_transforms(dataset: PackedDataset) -> Path:
     Raises:
         InputError: the operating system refused to write.
     """
-    arrays = {name: getattr(dataset, name) for name in _shapes(0)}
+    arrays, noise = {name: getattr(dataset, name) for name in _shapes(0)}, dataset.uncertainty
     content: dict[str, Any] = {
         "camera_model": "OPENCV",
         **asdict(dataset.intrinsics),
         **dict(zip(_DISTORTION, map(float, dataset.distortion), strict=True)),
         "object": dataset.object_name,
         "container": None if dataset.container is None else asdict(dataset.container),
-        "uncertainty": None
-        if dataset.uncertainty is None
-        else {name: values.tolist() for name, values in asdict(dataset.uncertainty).items()},
+        "uncertainty": None if noise is None else {name: values.tolist() for name, values in asdict(noise).items()},
         **{name: None if array is None else array.tolist() for name, array in arrays.items()},
         **{name: getattr(dataset, name) for name in ("flagged_values", "metric", *_MAY_BE_MISSING)},
         "effects": [asdict(effect) for effect in dataset.effects],
@@ -320,12 +315,10 @@ def _parse_transforms(root: Path, content: dict[str, Any], source: str) -> Packe
 
 
 def _parse_effect(content: dict[str, Any]) -> EffectEvidence:
-    def number(name: str) -> float | None:
-        return None if content[name] is None else float(content[name])
-
-    name, unit, sentence = (str(content[key]) for key in ("name", "unit", "sentence"))
-    evidence, noise, threshold = map(number, ("evidence", "noise", "threshold"))
-    return EffectEvidence(name, bool(content["present"]), evidence, noise, threshold, unit, sentence)
+    values: dict[str, Any] = {key: str(content[key]) for key in ("name", "unit", "sentence")}
+    for key in ("evidence", "noise", "threshold"):
+        values[key] = None if content[key] is None else float(content[key])
+    return EffectEvidence(present=bool(content["present"]), **values)
 
 
 def _parse_frame(root: Path, frame: dict[str, Any]) -> PackedFrame:
