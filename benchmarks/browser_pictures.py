@@ -27,7 +27,7 @@ from headless_browser import launch
 
 from hsi_sc_nerf.analysis.drawn_regions import PAGE_POINTS
 from hsi_sc_nerf.export.cloud import read_spectral_ply
-from hsi_sc_nerf.report.build import ReportSources, object_section, write_report
+from hsi_sc_nerf.report.build import object_section, write_report
 from hsi_sc_nerf.report.page import html_page
 
 REPORT_PX, VIEWER_PX, PHONE_PX = (1200, 1300), (1100, 900), (390, 844)
@@ -67,7 +67,7 @@ class BrowserPictures:
                 report.write_text(html_page("The report", "", {}, [card]), encoding="utf-8")
                 self._report(chromium, report)
                 return
-            write_report(self.run, report, ReportSources(self.cloud))
+            write_report(self.run, report, self.cloud)
             self._report(chromium, report)
             with viewer(self.run / "config.yml") as address:
                 self._viewer(chromium, address)

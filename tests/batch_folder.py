@@ -23,7 +23,7 @@ def traits_of(volume_ml=250.0, ndvi=0.7, regions=("bruise",), watertight=True, c
     """Content of ``traits.json``; a quarter of 200 cm² is bruised by angle, a fifth by mixture."""
     spectrum = MeanAndSd(np.full(3, 0.4), np.zeros(3))
     maps = [
-        SurfaceMap(name, "", np.zeros(4), lambda spectra: spectra[:, 0], definition=definition, unit=unit)
+        SurfaceMap(name, unit, np.zeros(4), lambda spectra: spectra[:, 0], definition=definition)
         for name, definition, unit in (("NDVI", "NDVI = 1", ""), ("WI", "WI = 1", ""), ("Brix", "", "%"))
         if definition or calibrated
     ]

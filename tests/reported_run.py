@@ -39,7 +39,7 @@ TRAITS = trait_content(
             )
             for name in (WHOLE, HOSTILE)
         ],
-        maps=[SurfaceMap(HOSTILE, "", np.zeros(3), lambda spectra: spectra[:, 0], unit=HOSTILE)],
+        maps=[SurfaceMap(HOSTILE, HOSTILE, np.zeros(3), lambda spectra: spectra[:, 0])],
     ),
     {},
 )

@@ -18,7 +18,7 @@ CHECKS_PATH = Path("report") / INSPECTION_NAME
 """File in the dataset with the inspection's content and the findings of all later steps."""
 MAY_BE_RED = (
     *("angles", "binning", "copies", "damaged", "dates", "exposure", "mirrored", "other-object", "paper", "scale"),
-    *("turn", "veil", "white", "white-clipped", "dark", "light-lines", "clipped", "drift", "noise"),
+    *("turn", "upright", "veil", "white", "white-clipped", "dark", "light-lines", "clipped", "drift", "noise"),
     *("poses-angles", "poses-aspect", "poses-camera", "poses-direction", "poses-scale", "poses-uncertain"),
     *("frames-hull", "frames-light", "frames-slip"),
     *("masks-border", "masks-cut", "masks-empty", "masks-hull", "masks-static", "band-order"),
