@@ -188,6 +188,10 @@ def _hull(
     odd_to_core, to_core = _odd(masks, core, brightness, excess)
     if not odd_to_core.any() and np.median(to_core[filled]) <= typical:
         return []
+    # Fewer frames make a coarser core, but show how much masks that all agree differ from what is voted for them.
+    odd &= contradiction > _contradiction(core, silhouettes_of(core)) + excess
+    if not odd.any():
+        return []
     others = {name: float(c) for name, c, is_odd in zip(names, contradiction, odd, strict=True) if is_odd}
     sentence = (
         f"The object in {names_in_short([*others])} has another shape than in the other frames: it is another "

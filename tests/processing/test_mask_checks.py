@@ -141,16 +141,21 @@ def test_a_frame_of_another_object_is_named(other):
     assert "--exclude ball_5" in finding.sentence
 
 
-def test_the_ends_of_half_a_turn_show_no_other_object():
+@pytest.mark.parametrize(("count", "span_deg"), [(2 * FRAMES, 180.0), (FRAMES, 90.0)])
+def test_the_ends_of_a_part_of_a_turn_show_no_other_object(count, span_deg):
     """Only they carve the hull from their directions, and the others outvote them."""
-    count = 2 * FRAMES
-    poses = np.stack([true_pose(angle) for angle in np.linspace(0.0, 180.0, count)])
+    poses = np.stack([true_pose(angle) for angle in np.linspace(0.0, span_deg, count)])
     masks = np.stack([ball(pose, (0.02, 0, 0), 0.025) | ball(pose, (-0.02, 0, 0), 0.025) for pose in poses])
 
+    def hull_of(masks):
+        return voted_hull(masks, poses, INTRINSICS)
+
     def frames_named(masks):
-        hull = voted_hull(masks, poses, INTRINSICS)
         names = [str(frame) for frame in range(count)]
-        found = check_masks(masks, names, hull, seen(masks), np.zeros(count, bool), lambda others: others)
+        nothing = np.zeros(count, bool)
+        found = check_masks(
+            masks, names, hull_of(masks), seen(masks), nothing, lambda others: hull_of(others).silhouettes
+        )
         return [[*finding.values["frames"]] for finding in found]
 
     assert frames_named(masks) == []
