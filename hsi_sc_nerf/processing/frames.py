@@ -262,7 +262,10 @@ def is_up_to_date(output_dir: Path, fingerprint: str) -> bool:
     if not is_packed(output_dir):
         return False
     try:
-        return open_packed(output_dir).fingerprint == fingerprint
+        dataset = open_packed(output_dir)
+        for frame in dataset.frames:
+            dataset.cube_of(frame)
+        return dataset.fingerprint == fingerprint
     except InputError:  # an incomplete dataset is made again
         return False
 

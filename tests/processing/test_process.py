@@ -314,13 +314,14 @@ def test_a_changed_capture_is_done_again_alone_and_an_outdated_dataset_does_not_
 
 
 @pytest.mark.slow
-def test_damaged_output_is_made_again(processed):
+@pytest.mark.parametrize("lost", ["masks/ball_1.png", "cubes/ball_2.bip"])
+def test_damaged_output_is_made_again(processed, lost):
     session, output = processed
     before = written(output)
     data = output / "cubes" / "ball_2.bip"
     data.write_bytes(data.read_bytes()[:-2])
     before |= {"ball_2": 0}
-    (output / "masks" / "ball_1.png").unlink()
+    (output / lost).unlink()
     run(session, output)
     assert rewritten(output, before) == ["ball_2"]
     assert open_packed(output).frames[0].mask().any()
