@@ -169,7 +169,7 @@ def _write_netcdf(path: Path, cloud: CloudStream) -> None:
         with h5netcdf.File(temporary, "w") as file:
             file.attrs.update(table_attributes(cloud.run, cloud.metric))
             file.dimensions = sizes
-            wavelength = file.create_variable("wavelength", ("wavelength",), "<f8", data=cloud.wavelengths_nm)
+            wavelength = file.create_variable("wavelength", ("wavelength",), data=np.sort(cloud.wavelengths_nm))
             wavelength.attrs.update(WAVELENGTH_ATTRIBUTES)
             for name, dtype, dimensions, attributes in variables:
                 file.create_variable(name, dimensions, dtype).attrs.update(attributes)
@@ -203,5 +203,5 @@ def _write_zarr(path: Path, cloud: CloudStream) -> None:
                 attributes=dict(attributes),
             )
 
-        create("wavelength", "<f8", ("wavelength",), WAVELENGTH_ATTRIBUTES)[:] = cloud.wavelengths_nm
+        create("wavelength", "<f8", ("wavelength",), WAVELENGTH_ATTRIBUTES)[:] = np.sort(cloud.wavelengths_nm)
         _fill({variable[0]: create(*variable) for variable in _variables(cloud)}, cloud)

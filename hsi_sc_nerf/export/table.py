@@ -4,7 +4,8 @@ The dimensions are ``point`` and ``wavelength`` (nm). ``reflectance`` (point, wa
 the cloud has the material's columns; per point ``x y z`` (metres, object frame: a local frame, so that there is no
 grid mapping), ``nx ny nz``, ``red green blue`` and the other extra columns. Standard deviations are the
 ``ancillary_variables`` of what they are of. Where nothing gave the scale, the attribute ``scale`` says so and
-positions have the unit 1.
+positions have the unit 1. Wavelengths ascend, also those of a camera whose bands do not: xarray finds the nearest
+one only so.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def to_xarray(cloud: SpectralCloud, run: str = "") -> xarray.Dataset:
         for name, dtype, dimensions, attributes in table_variables(stream(cloud))
     }
     positions = {axis: variables.pop(axis) for axis in "xyz"}
-    wavelength = ("wavelength", np.asarray(cloud.wavelengths_nm, float), WAVELENGTH_ATTRIBUTES)
+    wavelength = ("wavelength", np.sort(np.asarray(cloud.wavelengths_nm, float)), WAVELENGTH_ATTRIBUTES)
     return xarray.Dataset(variables, positions | {"wavelength": wavelength}, table_attributes(run, cloud.metric))
 
 
@@ -119,10 +120,10 @@ def table_variables(cloud: CloudStream) -> Iterator[tuple[str, str, tuple[str, .
 
 def table_columns(cloud: SpectralCloud) -> dict[str, Shaped[np.ndarray, "n *bands"]]:
     """The numbers of each variable."""
-    extra = dict(cloud.extra)
-    material = [extra.pop(name) for name in material_names(cloud.wavelengths_nm, tuple(extra))]
+    extra, order = dict(cloud.extra), np.argsort(cloud.wavelengths_nm)
+    material = [extra.pop(name) for name in material_names(cloud.wavelengths_nm[order], tuple(extra))]
     return {
-        "reflectance": cloud.spectra,
+        "reflectance": cloud.spectra[:, order],
         **({"material": np.stack(material, axis=-1)} if material else {}),
         **dict(zip("xyz", cloud.points.T, strict=True)),
         **dict(zip(NORMALS, cloud.normals.T, strict=True)),

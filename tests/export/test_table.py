@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from random_cloud import BAND_NAMES, assert_equal, random_cloud
 
+from hsi_sc_nerf.api.clouds import read_cloud
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import stream
 from hsi_sc_nerf.export.formats import write_cloud
@@ -57,6 +58,22 @@ def test_names_units_and_attributes_are_those_of_cf(metric):
     assert table.irradiance.ancillary_variables == "irradiance_std"
     assert "ancillary_variables" not in to_xarray(random_cloud()).reflectance.attrs
     assert not any("grid_mapping" in table[name].attrs for name in table.variables)
+
+
+@pytest.mark.parametrize("file_format", [None, "netcdf", "zarr"])
+def test_wavelengths_ascend_whatever_the_order_of_the_camera_s_bands(tmp_path, file_format):
+    ordered = full_cloud()
+    turned = replace(
+        ordered, wavelengths_nm=ordered.wavelengths_nm[[1, 3, 0, 2]], spectra=ordered.spectra[:, [1, 3, 0, 2]]
+    )
+    expected = to_xarray(ordered)
+    if file_format is None:
+        xarray.testing.assert_identical(to_xarray(turned), expected)
+    else:
+        pytest.importorskip({"netcdf": "h5netcdf"}.get(file_format, file_format))
+        assert_equal(read_cloud(write_cloud(tmp_path / "cloud", stream(turned, 7), file_format)), ordered)
+    table = to_xarray(turned)
+    np.testing.assert_array_equal(table.material.sel(wavelength=640.0, method="nearest"), expected.material[:, 2])
 
 
 def test_a_table_of_something_else_is_refused():
