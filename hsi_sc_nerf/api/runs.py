@@ -169,7 +169,7 @@ class Run:
             size: factor on the size of the image, of a view at an angle.
 
         Raises:
-            InputError: the session has no such frame.
+            InputError: the session has no such frame, the angle is not finite, or the size leaves no pixel.
         """
         model = self.trained.model
         if frame is None:

@@ -69,17 +69,30 @@ def views_of_orbit(run: TrainedRun, count: int, size: float = 1.0) -> Views:
 
     Args:
         size: factor on the size of the camera's images.
+
+    Raises:
+        InputError: no pixel is left.
     """
     cameras = cameras_at(run, np.arange(count) * 360.0 / count, size)
     return Views("orbit", cameras, [f"orbit_{i:03d}" for i in range(count)])
 
 
 def cameras_at(run: TrainedRun, angles_deg: Float[np.ndarray, "cameras"], size: float = 1.0) -> Cameras:
-    """The session's camera with the object turned counter-clockwise by angles from where the first frame saw it."""
+    """The session's camera with the object turned counter-clockwise by angles from where the first frame saw it.
+
+    Raises:
+        InputError: an angle is not finite, or the factor ``size`` on the images' size leaves no pixel.
+    """
+    camera = run.dataset.intrinsics
+    if not (np.isfinite(angles_deg).all() and size * min(camera.w, camera.h) >= 1.0):
+        raise InputError(
+            f"views need finite angles and images of a pixel at least, not {size:g} times {camera.w} x {camera.h} "
+            "pixels; correct them."
+        )
     first = run.refined_poses_m()[0]
     poses = np.stack([turntable_camera_to_world(first, angle) for angle in angles_deg])
     poses[:, :3, 3] = run.to_scene(poses[:, :3, 3])
-    cameras = pinhole_cameras(poses, run.dataset.intrinsics, run.dataset.distortion)
+    cameras = pinhole_cameras(poses, camera, run.dataset.distortion)
     cameras.rescale_output_resolution(size)
     return cameras
 

@@ -21,6 +21,7 @@ from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.rendering.pictures import find_false_colour, open_video
 from hsi_sc_nerf.rendering.views import (
     RenderedView,
+    cameras_at,
     render_view,
     views_of_orbit,
     views_of_path,
@@ -259,6 +260,12 @@ def test_an_orbit_of_another_size_without_cubes(tmp_path, run):
     with av.open(str(tmp_path / "out" / "orbit-pseudo-RGB.mp4")) as container:
         frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     assert [frame.shape for frame in frames] == [(24, 24, 3)] * 3
+
+
+@pytest.mark.parametrize(("angle_deg", "size"), [(0.0, 0.01), (0.0, float("nan")), (float("nan"), 1.0)])
+def test_views_without_pixels_or_place_are_refused_in_a_sentence(run, angle_deg, size):
+    with pytest.raises(InputError, match="finite angles and images of a pixel"):
+        cameras_at(run, np.array([angle_deg]), size)
 
 
 def test_a_run_that_fails_leaves_no_video(tmp_path, run, monkeypatch):
