@@ -307,6 +307,8 @@ def is_of_a_run(name: str) -> bool:
 def read_spectral_ply(path: Path | str) -> SpectralCloud:
     """Read a cloud that `write_spectral_ply` wrote, its properties in any order and as CloudCompare names them.
 
+    Bands come in ascending order: copies by Open3D have them in none.
+
     Raises:
         InputError: the file is missing, is no readable PLY, or lacks positions, normals, colours or spectral bands.
 
@@ -319,7 +321,8 @@ def read_spectral_ply(path: Path | str) -> SpectralCloud:
     content = read_ply(path)
     vertices = content["vertex"].data
     names = vertices.dtype.names
-    bands = {name: float(match[1]) for name in names if (match := _BAND_NAME.fullmatch(name))}
+    found = {name: float(match[1]) for name in names if (match := _BAND_NAME.fullmatch(name))}
+    bands = {name: found[name] for name in sorted(found, key=found.__getitem__)}
     missing = [name for name in (*_GEOMETRY, *COLOURS) if name not in names]
     if missing or not bands:
         lacking = ", ".join(missing) or "spectral bands (scalar_...nm)"

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from plyfile import PlyData
+from plyfile import PlyData, PlyElement
 from random_cloud import BAND_NAMES, WAVELENGTHS_NM, assert_equal, random_cloud
 
 from hsi_sc_nerf import __version__
@@ -76,6 +76,20 @@ def test_open3d_reads_it_and_its_copy_reads_back(tmp_path: Path) -> None:
     np.testing.assert_array_equal(tensor.point["scalar_650.00nm"].numpy()[:, 0], written.spectra[:, 2])
     open3d.t.io.write_point_cloud(str(copy), tensor)  # in another order
     assert_equal(read_spectral_ply(copy), written)
+
+
+def test_bands_ascend_whatever_the_order_of_the_columns(tmp_path: Path) -> None:
+    """Open3D's copies have them in none, others may put them in order by name: 1003.58nm before 397.32nm."""
+    written, path = random_cloud(), tmp_path / "cloud.ply"
+    write_spectral_ply(path, written)
+    rows = PlyData.read(str(path))["vertex"].data
+    by_name = np.empty(len(rows), [(name, rows.dtype[name]) for name in sorted(rows.dtype.names)])
+    for name in rows.dtype.names:
+        by_name[name] = rows[name]
+    PlyData([PlyElement.describe(by_name, "vertex")]).write(str(path))
+    read = read_spectral_ply(path)
+    np.testing.assert_array_equal(read.wavelengths_nm, written.wavelengths_nm)
+    np.testing.assert_array_equal(read.spectra, written.spectra)
 
 
 def test_a_copy_by_cloudcompare_keeps_material_and_incidence(tmp_path: Path) -> None:
