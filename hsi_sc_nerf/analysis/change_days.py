@@ -70,7 +70,7 @@ def days_on_one_mesh(
         >>> clouds = [read_spectral_ply(Path(day, "point_cloud.ply")) for day in ("monday", "friday")]
         >>> days = days_on_one_mesh(clouds, ("monday", "friday"), MeshConfig(), 65.0)
     """
-    clouds = [_with_ascending_bands(cloud) for cloud in clouds]
+    clouds = [cloud.with_ascending_bands() for cloud in clouds]
     nm = clouds[0].wavelengths_nm
     for cloud, name in zip(clouds, names, strict=True):
         if len(cloud.wavelengths_nm) != len(nm) or np.abs(cloud.wavelengths_nm - nm).max() > SAME_BAND_NM:
@@ -108,12 +108,6 @@ def days_on_one_mesh(
         seen_raised_m = np.where(seen, raised_m, np.nan)
         days.append(Day(name, replace(surface, seen=seen), seen_raised_m, _conditions(moved, near), attitude))
     return days
-
-
-def _with_ascending_bands(cloud: SpectralCloud) -> SpectralCloud:
-    """The same cloud; other programs write bands in any order."""
-    order = np.argsort(cloud.wavelengths_nm)
-    return replace(cloud, spectra=cloud.spectra[:, order], wavelengths_nm=cloud.wavelengths_nm[order])
 
 
 def _conditions(cloud: SpectralCloud, near: Int[np.ndarray, "v k"]) -> Float[np.ndarray, "v 3"]:

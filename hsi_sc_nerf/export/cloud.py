@@ -94,6 +94,11 @@ class SpectralCloud:
         own = {name: getattr(self, name)[rows] for name in ("points", "normals", "colours", "spectra")}
         return replace(self, **own, extra={name: column[rows] for name, column in self.extra.items()})
 
+    def with_ascending_bands(self) -> SpectralCloud:
+        """The same cloud; cameras and other programs have bands in any order."""
+        order = np.argsort(self.wavelengths_nm)
+        return replace(self, spectra=self.spectra[:, order], wavelengths_nm=self.wavelengths_nm[order])
+
 
 @dataclass(frozen=True)
 class CloudStream:
@@ -305,9 +310,7 @@ def is_of_a_run(name: str) -> bool:
 
 
 def read_spectral_ply(path: Path | str) -> SpectralCloud:
-    """Read a cloud that `write_spectral_ply` wrote, its properties in any order and as CloudCompare names them.
-
-    Bands come in ascending order: copies by Open3D have them in none.
+    """Read a cloud of `write_spectral_ply`, its properties in any order and as CloudCompare names them; bands ascend.
 
     Raises:
         InputError: the file is missing, is no readable PLY, or lacks positions, normals, colours or spectral bands.

@@ -10,6 +10,7 @@ import importlib
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -64,6 +65,8 @@ def write_cloud(path_without_suffix: Path, cloud: CloudStream, file_format: Clou
         names = ["wavelength", *(name for name, *_ in table_variables(cloud))]
         if odd := [name for name in names if "/" in name or names.count(name) > 1]:  # groups are separated by /
             raise InputError(f"{path}: cannot hold a column named {odd[0]}; give it another name, without /.")
+        ascending = (chunk.with_ascending_bands() for chunk in cloud.chunks)
+        cloud = replace(cloud, wavelengths_nm=np.sort(cloud.wavelengths_nm), chunks=ascending)
     writers: dict[CloudFormat, Callable[[Path, CloudStream], None]] = {
         "ply": write_spectral_ply,
         "las": _write_las,
@@ -169,7 +172,7 @@ def _write_netcdf(path: Path, cloud: CloudStream) -> None:
         with h5netcdf.File(temporary, "w") as file:
             file.attrs.update(table_attributes(cloud.run, cloud.metric))
             file.dimensions = sizes
-            wavelength = file.create_variable("wavelength", ("wavelength",), data=np.sort(cloud.wavelengths_nm))
+            wavelength = file.create_variable("wavelength", ("wavelength",), "<f8", data=cloud.wavelengths_nm)
             wavelength.attrs.update(WAVELENGTH_ATTRIBUTES)
             for name, dtype, dimensions, attributes in variables:
                 file.create_variable(name, dimensions, dtype).attrs.update(attributes)
@@ -203,5 +206,5 @@ def _write_zarr(path: Path, cloud: CloudStream) -> None:
                 attributes=dict(attributes),
             )
 
-        create("wavelength", "<f8", ("wavelength",), WAVELENGTH_ATTRIBUTES)[:] = np.sort(cloud.wavelengths_nm)
+        create("wavelength", "<f8", ("wavelength",), WAVELENGTH_ATTRIBUTES)[:] = cloud.wavelengths_nm
         _fill({variable[0]: create(*variable) for variable in _variables(cloud)}, cloud)

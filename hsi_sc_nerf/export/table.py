@@ -57,13 +57,14 @@ def to_xarray(cloud: SpectralCloud, run: str = "") -> xarray.Dataset:
         raise InputError(
             "to_xarray needs the package xarray, which is not installed; run `pip install 'hsi-sc-nerf[formats]'`."
         ) from error
+    cloud = cloud.with_ascending_bands()
     columns = table_columns(cloud)
     variables = {
         name: (dimensions, columns[name].astype(dtype), attributes)
         for name, dtype, dimensions, attributes in table_variables(stream(cloud))
     }
     positions = {axis: variables.pop(axis) for axis in "xyz"}
-    wavelength = ("wavelength", np.sort(np.asarray(cloud.wavelengths_nm, float)), WAVELENGTH_ATTRIBUTES)
+    wavelength = ("wavelength", np.asarray(cloud.wavelengths_nm, float), WAVELENGTH_ATTRIBUTES)
     return xarray.Dataset(variables, positions | {"wavelength": wavelength}, table_attributes(run, cloud.metric))
 
 
@@ -120,10 +121,10 @@ def table_variables(cloud: CloudStream) -> Iterator[tuple[str, str, tuple[str, .
 
 def table_columns(cloud: SpectralCloud) -> dict[str, Shaped[np.ndarray, "n *bands"]]:
     """The numbers of each variable."""
-    extra, order = dict(cloud.extra), np.argsort(cloud.wavelengths_nm)
-    material = [extra.pop(name) for name in material_names(cloud.wavelengths_nm[order], tuple(extra))]
+    extra = dict(cloud.extra)
+    material = [extra.pop(name) for name in material_names(cloud.wavelengths_nm, tuple(extra))]
     return {
-        "reflectance": cloud.spectra[:, order],
+        "reflectance": cloud.spectra,
         **({"material": np.stack(material, axis=-1)} if material else {}),
         **dict(zip("xyz", cloud.points.T, strict=True)),
         **dict(zip(NORMALS, cloud.normals.T, strict=True)),
