@@ -80,6 +80,8 @@ def write_report(
     Example:
         >>> write_report(Path("outputs/pear/hsi-sc-nerf/run"), Path("report.html"), views=4)
     """
+    if (views is not None and views < 1) or points < 1:
+        raise InputError("--views and --points must be at least 1.")
     # Before the slow rendering, so that unusable files are refused at once.
     comparison_path = _given_or_beside(comparison, folder / "comparison.json", "hsi-sc-nerf compare")
     traits_path = _given_or_beside(traits, folder / "traits.json", "hsi-sc-nerf traits")

@@ -12,7 +12,7 @@ from results_table import RESULTS, read_results
 from hsi_sc_nerf.analysis.change import compare_days
 from hsi_sc_nerf.analysis.change_days import Day
 from hsi_sc_nerf.analysis.change_pictures import draw_change, draw_class_change
-from hsi_sc_nerf.analysis.change_regions import LIMIT_M2, LIMIT_PART
+from hsi_sc_nerf.analysis.change_regions import LIMIT_M2, LIMIT_PART, limit_of_blank_m2
 from hsi_sc_nerf.analysis.change_registration import Attitude
 from hsi_sc_nerf.analysis.change_report import change_rows, write_change_ply, write_change_tables
 from hsi_sc_nerf.analysis.library import SpectralLibrary
@@ -120,6 +120,13 @@ def test_a_region_above_the_limit_counts_beside_one_below_it(alone):
     assert whole["area_after_cm2"] == pytest.approx(large["area_after_cm2"])
     bruise = one.classes["bruise"]
     assert [np.sign(region.centre_m[0]) for region in bruise] == [-1.0]
+
+
+def test_the_limit_is_a_part_of_what_was_seen_and_at_least_an_area(first, alone):
+    seen_m2 = first.surface.areas_m2[first.surface.seen].sum()
+    for scale, limit_m2 in ((1.0, LIMIT_M2), (3.0, LIMIT_PART * 9.0 * seen_m2)):
+        assert limit_of_blank_m2(scale**2 * seen_m2) == pytest.approx(limit_m2)
+    assert {quantity.limit_m2 for quantity in alone[0].quantities.values()} == {LIMIT_M2}
 
 
 def test_page_table_and_cloud_tell_what_is_undecided(first, alone, tmp_path):

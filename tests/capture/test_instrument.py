@@ -1,5 +1,6 @@
 """Whole SPECIM IQ captures: metadata, whites of their own, finished reflectance, images on their side."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,7 @@ from capture_factory import BANDS, SIZE_PX, WAVELENGTHS_NM
 from hsi_sc_nerf.calibration.white_source import white_source
 from hsi_sc_nerf.capture.envi import write_cube
 from hsi_sc_nerf.capture.instrument import natural_order, read_metadata
-from hsi_sc_nerf.capture.session import Session, open_session
-from hsi_sc_nerf.capture.session_info import SessionInfo
+from hsi_sc_nerf.capture.session import open_session
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.processing.frames import capture_files, session_files
 
@@ -204,7 +204,9 @@ def test_a_real_instrument_lies_on_its_side(tmp_path, fields, rotation_deg):
 
 @pytest.mark.parametrize("rotation_deg", [0, 90, 180, 270])
 def test_quarter_turns_set_upright(tmp_path, rotation_deg):
-    session = Session(tmp_path, SessionInfo(), None, (), rotation_deg)
+    two(tmp_path, xml=XML.format(time=10, mode="Custom"))
+    (tmp_path / "session.json").write_text(json.dumps({"image_rotation_deg": rotation_deg}))
+    session = open_session(tmp_path)
     upright = np.arange(6).reshape(2, 3)
     lying = np.rot90(upright, rotation_deg // 90)
     np.testing.assert_array_equal(np.rot90(lying, session.quarter_turns), upright)

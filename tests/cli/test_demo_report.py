@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from hsi_sc_nerf.cli.demo_report import draw_cloud, draw_spectra, draw_views
+from hsi_sc_nerf.errors import InputError
 
 WAVELENGTHS = np.linspace(400.0, 1000.0, 7)
 RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
@@ -85,6 +86,13 @@ def test_a_stray_point_does_not_shrink_the_object(tmp_path: Path) -> None:
     colours = np.full((5001, 3), RED, np.uint8)
     draw_cloud(tmp_path / "cloud.png", np.concatenate([points, [[0.0, 9.0, 0.0]]]), colours)
     assert len(where(drawn(tmp_path / "cloud.png"), RED)) > 100_000
+
+
+def test_a_picture_that_cannot_be_written_is_named_and_leaves_nothing(tmp_path: Path) -> None:
+    (tmp_path / "views.png").mkdir()
+    with pytest.raises(InputError, match=r"views\.png"):
+        draw_views(tmp_path / "views.png", [plain(RED)], [plain(GREEN)], ["a"])
+    assert [file.name for file in tmp_path.iterdir()] == ["views.png"]
 
 
 @pytest.mark.slow

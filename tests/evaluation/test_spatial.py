@@ -69,6 +69,12 @@ def test_samples_are_even_over_the_area_whatever_the_triangles() -> None:
     assert abs(np.sum(points[:, 1] > points[:, 0]) - 20_000) <= 1
 
 
+def test_samples_repeat_with_the_seed() -> None:
+    same = [sample_surface(SQUARE, TRIANGLES, 100, seed=5) for _ in range(2)]
+    np.testing.assert_array_equal(*same)
+    assert (sample_surface(SQUARE, TRIANGLES, 100, seed=6) != same[0]).any()
+
+
 def test_a_mesh_without_area_is_refused() -> None:
     for triangles in (np.zeros((0, 3), int), np.array([[0, 0, 0]])):
         with pytest.raises(ValueError, match="no area"):

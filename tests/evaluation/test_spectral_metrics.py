@@ -122,7 +122,15 @@ def test_closed_forms() -> None:
     assert found["psnr"] == pytest.approx(20, rel=1e-6)
     assert found["ssim"] == pytest.approx((2 * 0.6 * 0.5 + 1e-4) / (0.36 + 0.25 + 1e-4), rel=1e-6)
     assert found["ssim_windowed"] == pytest.approx(found["ssim"], rel=1e-6)
-    assert metrics.spectral_angle_mapper(target, torch.zeros_like(target)).item() == pytest.approx(math.pi / 2)
+
+
+def test_known_angle_of_every_pixel() -> None:
+    target = torch.zeros(H, W, 2)
+    target[..., 0] = 0.7
+    angle = 1e-6
+    predicted = 0.3 * torch.stack([torch.full((H, W), math.cos(angle)), torch.full((H, W), math.sin(angle))], -1)
+    assert metrics.spectral_angle_mapper(predicted, target).item() == pytest.approx(angle, rel=1e-3)
+    assert metrics.spectral_angle_mapper(predicted, torch.zeros_like(target)).item() == pytest.approx(math.pi / 2)
 
 
 def test_ssim_of_the_whole_mask_ignores_where_pixels_lie_and_the_windowed_one_does_not() -> None:

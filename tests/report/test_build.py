@@ -125,6 +125,8 @@ def test_files_that_are_something_else_are_refused_and_nothing_is_written(run, t
     for sources, sentence in (
         ({"traits": tmp_path / "broken.json"}, r"broken\.json: is not a JSON object"),
         ({"comparison": run / "no.json"}, r"no\.json: there is no such file"),
+        ({"views": 0}, "at least 1"),
+        ({"points": 0}, "at least 1"),
         ({"indices": ("own = R1240",)}, "1240 nm"),
         ({"calibrations": (run / "no.csv",)}, r"no\.csv: cannot be read"),
     ):
