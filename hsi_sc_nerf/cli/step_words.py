@@ -8,21 +8,24 @@ from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import tyro
 
 from hsi_sc_nerf.batch.session_steps import WORDED_STEPS, SessionSettings, session_steps
-from hsi_sc_nerf.benchmark.configurations import split_words
+from hsi_sc_nerf.benchmark.configurations import OURS, split_words, training_config
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.settings_file import check_options
+
+if TYPE_CHECKING:
+    from hsi_sc_nerf.models.staged_trainer import StagedTrainerConfig
 
 _GIVEN = ("--output-dir", "--output", "--load-config", "--experiment-name", "--timestamp", "--method-name")
 """Options that say where a step reads or writes: the other steps go by them."""
 
 
 def check_words(settings: SessionSettings, outs: Sequence[Path] = ()) -> None:
-    """Check the words for our commands; those for ns-train are left to it.
+    """Check the words for the commands.
 
     Args:
         settings: with the words.
@@ -48,6 +51,7 @@ def check_words(settings: SessionSettings, outs: Sequence[Path] = ()) -> None:
     material = _read("material", settings.material, MaterialCommand, "cloud", "--load-config", "config.yml")
     traits = _read("traits", settings.traits, TraitsCommand, "cloud", "--output-dir", "out")
     for name, check in (
+        ("train", partial(_require_trainable, split_words(settings.train))),
         ("process", partial(check_options, process.config)),
         ("material", material.checked_light),
         ("traits", traits.check),
@@ -61,6 +65,17 @@ def check_words(settings: SessionSettings, outs: Sequence[Path] = ()) -> None:
             replace(traits, output_dir=out / "traits").require_inputs_kept()
         except InputError as error:
             raise InputError(f"--traits: {error}") from error
+
+
+def _require_trainable(words: Sequence[str]) -> None:
+    """Refuse words that ns-train does not take; without any, its libraries need not be loaded."""
+    if not words:
+        return
+    config = cast("StagedTrainerConfig", training_config(OURS, words))
+    try:
+        config.plan()
+    except SystemExit as end:
+        raise InputError(str(end.code).removeprefix("hsi-sc-nerf: ")) from end
 
 
 def _require_inputs_kept(settings: SessionSettings, out: Path) -> None:

@@ -78,6 +78,8 @@ def test_nonsense_is_one_sentence(config, told):
         # The other steps would not find the results, after hours of training.
         (SessionSettings(train="--vis viewer --timestamp mine"), "--train: --timestamp is given by the step itself"),
         (SessionSettings(train="--output_dir=elsewhere"), "--train: --output-dir is given"),
+        (SessionSettings(train="--pipeline.model.efects none"), "--train: .*--pipeline.model.efects none"),
+        (SessionSettings(train="--max-num-iterations 0"), "--train: .*iterations"),
         (SessionSettings(process="--output-dir elsewhere"), "--process: --output-dir is given"),
         (SessionSettings(material="--output other.ply"), "--material: --output is given"),
         (SessionSettings(traits="--output-dir elsewhere"), "--traits: --output-dir is given"),
@@ -91,6 +93,7 @@ def test_words_for_a_step_are_refused_before_the_first(settings, told):
 @pytest.mark.slow
 def test_words_that_a_step_knows_pass():
     check_words(SessionSettings(process="--masks.pieces 2", traits="--index PRI --roi a 0 0 0 0.01"))
+    check_words(SessionSettings(train="--pipeline.model.effects none --max-num-iterations 300 --vis tensorboard"))
     check_words(SessionSettings(traits="--index 'CRI = 1/R510 - 1/R550' --index own=R510"))
 
 
