@@ -4,7 +4,8 @@
     uv run python benchmarks/mask_cases.py --size-px 96 --scenes pear maize
 
 A mask is wrong where its intersection over union (IoU) with the true object pixels is below 0.95; then the session
-must be refused.
+must be refused. How far the outline lies outside (inside: negative) of the object is the difference of the areas of
+masks and object over the number of pixels along the outline.
 """
 
 from __future__ import annotations
@@ -19,11 +20,12 @@ from typing import ClassVar
 import cv2
 import numpy as np
 import tyro
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from results_table import Benchmark, write_results
 from rich.progress import track
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.morphology import beside
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
 from hsi_sc_nerf.simulate.effects.image import TexturedBackground
 from hsi_sc_nerf.simulate.materials import Material, Plain, PlantTissue
@@ -109,13 +111,18 @@ SCENES: dict[str, Scene] = {
     "white apple, white lid": _scene("apple", *NOISE, own=WHITE_FRUIT),
     "white apple, white lid, uneven light": _scene("apple", *SHADE, own=WHITE_FRUIT),
     "dark apple, dark lid, textured wall": _scene("apple", *WALL, own=DARK_FRUIT),
+    "tomato before a lamp": _scene("tomato", "lamp", *SHADE),
+    "glossy tomato before a lamp": _scene("tomato", "lamp", "gloss", *NOISE),
     "smooth green sphere, textured wall": replace(
         _scene("sphere", *WALL), object=Sphere("sphere", 0.08, "pear_skin")
     ),
 }
 MIXED = "pear, two frames of another pear"
 SWAPPED = (5, 12)
-COLUMNS = ["session", "size, px", "IoU, lowest", "IoU, median", "refused because of"]
+LOWEST = 0.1
+"""Part of the object's height in the image where it stands on the lid."""
+COLUMNS = ["session", "size, px", "IoU, lowest", "IoU, median", "outline, px", "of the lowest tenth, px"]
+COLUMNS += ["refused because of"]
 
 
 @dataclass(frozen=True)
@@ -152,7 +159,7 @@ def _swap_frames(session: Path, other: Path, size_px: int) -> None:
 
 
 def _cells(session: Path, data: Path, mixed: bool) -> list[str]:
-    """Smallest and median IoU, and the names of the checks that refused the session."""
+    """Smallest and median IoU, offsets of the outline, and the names of the checks that refused the session."""
     # The check of the masks is measured, not the one of the raw captures.
     config = ProcessConfig(accept=("other-object",) if mixed else ())
     refused = ""
@@ -161,14 +168,33 @@ def _cells(session: Path, data: Path, mixed: bool) -> list[str]:
     except InputError as error:
         refused = ", ".join(re.findall(r"--accept ([a-z-]+)", str(error))) or "no object"
     truth = load_truth(session)
-    ious = []
+    ious, areas = [], []
     for number, capture in enumerate(truth.captures):
         path = data / "masks" / f"{capture}.png"
         if path.is_file() and not (mixed and number in SWAPPED):
             mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) > 0
-            covered = truth.object_coverage(capture) > COVERED
+            coverage = truth.object_coverage(capture)
+            covered = coverage > COVERED
             ious.append((mask & covered).sum() / (mask | covered).sum())
-    return [*(f"{value:.3f}" for value in (min(ious), np.median(ious))), refused] if ious else ["", "", refused]
+            areas.append([_area_too_much(mask, coverage, part) for part in (1.0, LOWEST)])
+    if not ious:
+        return ["", "", "", "", refused]
+    offsets = np.sum(areas, axis=0)
+    return [
+        *(f"{value:.3f}" for value in (min(ious), np.median(ious))),
+        *(f"{too_much / length:+.2f}" for too_much, length in offsets),
+        refused,
+    ]
+
+
+def _area_too_much(
+    mask: Bool[np.ndarray, "h w"], coverage: Float[np.ndarray, "h w"], part: float
+) -> tuple[float, int]:
+    """How much larger the mask is than the object in a lower part of its image, and the pixels along the outline."""
+    covered = coverage > COVERED
+    lines = np.flatnonzero(covered.any(axis=1))
+    top = 0 if part == 1.0 else round(lines[-1] - part * (lines[-1] - lines[0]))
+    return float((mask - coverage)[top:].sum()), int(beside(covered, 1)[top:].sum())
 
 
 if __name__ == "__main__":

@@ -58,8 +58,8 @@ def check_masks(
         hull: hull of the masks.
         left_out: frames with a piece that its mask leaves out (`masks.foreground_masks`).
         silhouettes_of: gives those of the visual hull of other masks.
-        regions: pixels that may be the object's (`masks.above_lid`), if the container is known.
-        lid_middles: pixels that see the middle of the lid (`masks.lid_middle`), if the container is known.
+        regions: pixels that may be the object's (`lid_regions.above_lid`), if the container is known.
+        lid_middles: pixels that see the middle of the lid (`lid_regions.lid_middle`), if the container is known.
 
     Example:
         >>> found = check_masks(masks, names, hull, brightness, left_out, silhouettes_of)

@@ -3,8 +3,9 @@
 Otsu's threshold separates the object's foreground scores from the others. What lies below the container's lid is
 excluded by geometry. The edge is decided locally: parts of the object in shade belong to it, and so do mixed pixels
 of which the object covers at least half. Light scales foreground score and brightness by the same factor, so their
-ratio depends on the material alone. The score of a mixed pixel is its fraction of object times the score of the
-object beside it, whatever the background is.
+ratio depends on the material alone. The score of a mixed pixel lies between those of the object and of the
+background beside it, by its fraction of object. That of the background is not 0 where the object's light falls on it,
+as on the lid beside the base.
 """
 
 from __future__ import annotations
@@ -21,9 +22,7 @@ from scipy.stats import median_abs_deviation
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_png
-from hsi_sc_nerf.geometry.camera import PinholeIntrinsics, image_of, pixel_rays
 from hsi_sc_nerf.morphology import components, dilate, draw_outline, ellipse_close_open, fill_holes, touching
-from hsi_sc_nerf.packed.dataset import Container
 from hsi_sc_nerf.processing.foreground_score import background_subspace, foreground_score, otsu_threshold
 from hsi_sc_nerf.settings_file import between
 
@@ -31,8 +30,6 @@ MIN_CONTRAST = 0.005
 """Smallest difference between the mean scores of object and background that Otsu's threshold is accepted with."""
 MIN_SEPARATION = 6.0
 """Smallest such difference as a multiple of the background's scatter; noise alone has 3 to 5."""
-LID_MIDDLE = 0.3
-"""Radius of the middle of the container's lid, of the lid's."""
 LEAST_PIECE = 0.1
 """Smallest area of a separate piece of the object, of the largest piece's; what is smaller is noise."""
 CLOSING_FRACTION = 0.01
@@ -42,8 +39,8 @@ COLUMNS, TILE_PX = 6, 240
 """Frames in a row of the contact sheet, and the width of each."""
 NEARBY_PX = 2.0
 """Standard deviation of the Gaussian weights of averages over a pixel's neighbourhood."""
-HALF_COVERED = 0.5
-"""Score of a pixel that is half object, relative to the object beside it."""
+LEAST_AT_EDGE, RING_PX = 0.5, 20
+"""Smallest score at the edge, relative to the object near it; the fewest pixels of a ring that are measured."""
 GROWTH_PX = 2
 """Pixels by which the edge may move outwards where the local score is low and the global threshold too high."""
 # Fractions of the object's median brightness: a background brighter than the first makes all mixed pixels bright;
@@ -64,7 +61,8 @@ class MaskConfig:
     """Parts that stick out of the object (a stem) are added from this fraction of the threshold; 1 for none."""
     shaded_fraction: float | None = between(0.0, 10.0, default=0.5)
     """Pixels next to the object and darker than it are added where their score relative to their brightness is more
-    than this fraction of the object's; None for none. Not applied next to even darker pixels."""
+    than this fraction of the way from that of what is beside them to the object's; None for none. Not applied next to
+    even darker pixels."""
     overhang: float | None = between(0.01, 100.0, default=None)
     """The object may reach beyond the container's lid up to this multiple of the lid's radius. 1.2 if not given, or
     1.6 or 2.4 where the object is cut off otherwise."""
@@ -81,7 +79,7 @@ def foreground_masks(
     """Masks of the object in all frames, with one threshold, and which frames show a piece that they leave out.
 
     Args:
-        regions: pixels of each frame that may be the object's (`above_lid`); all if not given.
+        regions: pixels of each frame that may be the object's (`lid_regions.above_lid`); all if not given.
 
     Raises:
         InputError: the spectra of object and background hardly differ.
@@ -169,46 +167,6 @@ def _closing_px(image: Float[np.ndarray, "h w"]) -> int:
     return max(3, round(CLOSING_FRACTION * min(image.shape))) | 1  # odd
 
 
-def above_lid(
-    intrinsics: PinholeIntrinsics,
-    distortion: Float[np.ndarray, "4"],
-    camera_to_world: Float[np.ndarray, "4 4"],
-    container: Container,
-    overhang: float,
-) -> Bool[np.ndarray, "h w"]:
-    """Pixels whose rays pass through the space above the container's lid before they meet the container.
-
-    Args:
-        distortion: k1, k2, p1, p2 (OpenCV).
-        camera_to_world: pose in the object frame, OpenGL axes, metres.
-        container: upright cylinder about the z axis, from z = 0 up.
-        overhang: the space above the lid is a cylinder of this multiple of the container's radius.
-    """
-    x, y = np.meshgrid(np.arange(intrinsics.w) + 0.5, np.arange(intrinsics.h) + 0.5)
-    pixels = np.stack([x, y], axis=-1)
-    if np.any(distortion):
-        matrix = intrinsics.matrix()
-        pixels = cv2.undistortPoints(pixels.reshape(-1, 1, 2), matrix, distortion, P=matrix).reshape(pixels.shape)
-    origin, directions = pixel_rays(intrinsics, camera_to_world, pixels)
-    radius, height = container.diameter_m / 2.0, container.height_m
-    above, above_end = _cylinder_interval(origin, directions, overhang * radius, height, np.inf)
-    solid, solid_end = _cylinder_interval(origin, directions, radius, 0.0, height)
-    return (above < above_end) & ~((solid < solid_end) & (solid <= above))
-
-
-def lid_middle(
-    intrinsics: PinholeIntrinsics, camera_to_world: Float[np.ndarray, "4 4"], container: Container
-) -> Bool[np.ndarray, "h w"]:
-    """Pixels that see the middle of the empty lid, `LID_MIDDLE` of its radius; lens distortion is neglected.
-
-    What stands on the axis hides them, and no wall is seen there.
-    """
-    ticks = np.linspace(-1.0, 1.0, 41) * LID_MIDDLE * container.diameter_m / 2.0
-    x, y = (coordinate.ravel() for coordinate in np.meshgrid(ticks, ticks))
-    points = np.stack([x, y, np.full_like(x, container.height_m)], axis=-1)[np.hypot(x, y) <= ticks[-1]]
-    return image_of(points, camera_to_world, intrinsics)
-
-
 def mask_picture(
     path: Path,
     images: Sequence[UInt8[np.ndarray, "h w 3"]],
@@ -236,21 +194,6 @@ def mask_picture(
     write_png(path, np.concatenate([np.concatenate(row, axis=1) for row in rows]))
 
 
-def _cylinder_interval(
-    origin: Float[np.ndarray, "3"], directions: Float[np.ndarray, "h w 3"], radius: float, low: float, high: float
-) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
-    """Ray parameters, 0 or more, between which x² + y² <= radius² and low <= z <= high; begin > end for a miss."""
-    a = np.maximum(np.sum(directions[..., :2] ** 2, axis=-1), 1e-18)
-    b = np.sum(directions[..., :2] * origin[:2], axis=-1)
-    discriminant = b**2 - a * (np.sum(origin[:2] ** 2) - radius**2)
-    root = np.sqrt(np.maximum(discriminant, 0.0))
-    slope = np.where(np.abs(directions[..., 2]) < 1e-12, 1e-12, directions[..., 2])
-    first, second = (low - origin[2]) / slope, (high - origin[2]) / slope
-    begin = np.maximum(np.maximum((-b - root) / a, np.minimum(first, second)), 0.0)
-    end = np.minimum((-b + root) / a, np.maximum(first, second))
-    return np.where(discriminant > 0.0, begin, np.inf), end
-
-
 def shaded_parts(
     body: Bool[np.ndarray, "h w"],
     score: Float[np.ndarray, "h w"],
@@ -266,7 +209,8 @@ def shaded_parts(
 
     Args:
         region: pixels that may be the object's; all if not given.
-        fraction: fraction of the object's median ratio of score and brightness, from which a pixel belongs to it.
+        fraction: of the way from the ratio of score and brightness beside a pixel, where nothing can be the object's,
+            to the object's median ratio, from which a pixel belongs to it.
 
     Returns:
         The pixels to add, none where the background, of the frame and beside the pixel, is dark.
@@ -275,7 +219,9 @@ def shaded_parts(
         return np.zeros_like(body)
     typical = float(np.median(brightness[body]))
     relative = score / np.maximum(brightness, _MIN_BRIGHTNESS * typical)
-    shaded = (relative > fraction * np.median(relative[body])) & (brightness < typical) & ~body
+    least = fraction * np.median(relative[body])
+    least = least + (1.0 - min(fraction, 1.0)) * _nearby(relative, ~(body | (relative > least)))
+    shaded = (relative > least) & (brightness < typical) & ~body
     if region is not None:
         shaded &= region
     shaded &= _bright_behind(brightness, body, ~(body | shaded))
@@ -300,15 +246,39 @@ def at_half_coverage(
     if not mask.any():
         return mask
     for _ in range(GROWTH_PX):
-        inside = _nearby(score, binary_erosion(mask, _FACES))
+        half = _half_covered(score, mask)
         rim = binary_dilation(mask, _FACES) & ~mask & may_grow
-        mask = fill_holes(mask | (rim & (inside > 0.0) & (score > HALF_COVERED * inside)))
+        mask = fill_holes(mask | (rim & (half > 0.0) & (score > half)))
     core = binary_erosion(mask, _FACES)
     relative = score / np.maximum(brightness, 1e-3)
-    in_shade = (relative >= HALF_COVERED * _nearby(relative, core)) & _bright_behind(brightness, mask, ~mask)
+    in_shade = (relative >= _half_covered(relative, mask)) & _bright_behind(brightness, mask, ~mask)
     edge = binary_dilation(core, _FACES) & ~core
-    too_little = (score < HALF_COVERED * _nearby(score, core)) & ~in_shade & edge
-    return fill_holes(mask & ~too_little)
+    return fill_holes(mask & ~((score < _half_covered(score, mask)) & ~in_shade & edge))
+
+
+def _half_covered(image: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """What pixels that are half object and half background would have, by those near them; 0 far from the object."""
+    core = binary_erosion(mask, _FACES)
+    inside = _nearby(image, core)
+    inside *= _at_edge(np.divide(image, inside, out=np.ones_like(inside), where=inside > 0.0), core)
+    outside = _nearby(image, ~binary_dilation(mask, _FACES, iterations=2))
+    return (inside + np.minimum(outside, inside)) / 2.0
+
+
+def _at_edge(relative: Float[np.ndarray, "h w"], core: Bool[np.ndarray, "h w"]) -> float:
+    """The object's score at its edge, relative to that near it, by a parabola through the three outermost rings.
+
+    A glossy skin mirrors the chamber the more, the flatter it is looked at.
+    """
+    rings = []
+    for _ in range(3):
+        inner = binary_erosion(core, _FACES)
+        rings.append(relative[core & ~inner])
+        core = inner
+    if min(map(len, rings)) < RING_PX:
+        return 1.0
+    first, second, third = map(np.median, rings)
+    return float(np.clip(3.0 * first - 3.0 * second + third, LEAST_AT_EDGE, 1.0))
 
 
 def _bright_behind(

@@ -18,8 +18,9 @@ from hsi_sc_nerf.findings import Finding
 from hsi_sc_nerf.packed.dataset import Container, PackedFrame
 from hsi_sc_nerf.poses.result import TurntablePoses
 from hsi_sc_nerf.processing.frames import BinsOfFrames, FrameCache
+from hsi_sc_nerf.processing.lid_regions import above_lid, lid_middle
 from hsi_sc_nerf.processing.mask_checks import check_masks
-from hsi_sc_nerf.processing.masks import MaskConfig, above_lid, foreground_masks, lid_middle, mask_picture
+from hsi_sc_nerf.processing.masks import MaskConfig, foreground_masks, mask_picture
 from hsi_sc_nerf.processing.visual_hull import VotedHull, voted_hull
 
 OVERHANGS = (1.2, 1.6, 2.4)

@@ -9,8 +9,8 @@ from capture_factory import SPHERE_CENTRE_M, SPHERE_RADIUS_M, sphere_mask, true_
 from hsi_sc_nerf.geometry.camera import PinholeIntrinsics
 from hsi_sc_nerf.morphology import dilate
 from hsi_sc_nerf.packed.dataset import Container
+from hsi_sc_nerf.processing.lid_regions import above_lid, lid_middle
 from hsi_sc_nerf.processing.mask_checks import check_masks
-from hsi_sc_nerf.processing.masks import above_lid, lid_middle
 from hsi_sc_nerf.processing.visual_hull import voted_hull
 
 INTRINSICS = PinholeIntrinsics(64, 64, 120.0, 120.0, 32.0, 32.0)
