@@ -261,7 +261,7 @@ def _half_covered(image: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]
     core = binary_erosion(mask, _FACES)
     inside = _nearby(image, core)
     inside *= _at_edge(np.divide(image, inside, out=np.ones_like(inside), where=inside > 0.0), core)
-    outside = _nearby(image, ~binary_dilation(mask, _FACES, iterations=2))
+    outside = _nearby(image, ~binary_dilation(mask, _FACES))
     return (inside + np.minimum(outside, inside)) / 2.0
 
 

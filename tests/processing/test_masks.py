@@ -7,6 +7,7 @@ from capture_factory import frame_reflectance, sphere_mask, true_pose
 from scipy import ndimage
 
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.morphology import beside
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.processing.foreground_score import smoothed_bins
 from hsi_sc_nerf.processing.masks import (
@@ -116,6 +117,24 @@ def test_the_shaded_underside_is_the_objects(tmp_path):
     assert mean_overlap(MaskConfig(shaded_fraction=None)) < found - 0.005
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("blank_figures")
+def test_the_lid_in_the_light_of_a_fruit_is_not_the_objects(tmp_path):
+    """Beside its base, the lid lies in the fruit's shade and gets a large part of its light from it."""
+    effects = ("chamber_shading", "inter_reflection", "photon_noise")
+    scene = override(load_scene("tomato"), frames=4, size_px=96, bands=12, effects=effects)
+    session = simulate_session(scene, tmp_path / "session", progress=False)
+    truth = load_truth(session)
+    too_much = length = 0.0
+    for frame in open_packed(process_session(session, tmp_path / "data", progress=False)).frames:
+        coverage = truth.object_coverage(frame.capture)
+        lines = np.flatnonzero((coverage > 0.5).any(axis=1))
+        lowest = slice(round(lines[-1] - 0.1 * np.ptp(lines)), None)
+        too_much += (frame.mask() - coverage)[lowest].sum()
+        length += beside(coverage > 0.5, 1)[lowest].sum()
+    assert abs(too_much / length) < 0.25
+
+
 SUPERSAMPLING = 16
 
 
@@ -175,15 +194,30 @@ def disc(radius: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("dark_half", [1.0, 0.6])
-@pytest.mark.parametrize("wall", [0.05, 0.9])
+@pytest.mark.parametrize(("wall", "bounced"), [(0.05, 0.0), (0.9, 0.0), (0.9, 0.3)])
 @pytest.mark.parametrize("offset_px", [-1.0, 0.0, 0.7])
-def test_the_edge_is_where_pixels_are_half_covered(dark_half, wall, offset_px):
+def test_the_edge_is_where_pixels_are_half_covered(dark_half, wall, bounced, offset_px):
+    """Also where the object's light falls on what is behind it, which then has a part of its score."""
     coverage = disc(12.0)
     albedo = np.where(np.arange(40) < 20, 1.0, dark_half) * 0.4
-    score, bright = 0.3 * albedo * coverage, albedo * coverage + wall * (1.0 - coverage)
+    score = 0.3 * albedo * (coverage + bounced * (1.0 - coverage))
+    bright = albedo * coverage + wall * (1.0 - coverage)
     refined = at_half_coverage(disc(12.0 + offset_px) > 0.5, score, bright, score > 0.005)
     assert not (refined & (coverage < 0.4)).any()
     assert not (~refined & (coverage > 0.7)).any()
+
+
+def test_a_glossy_skin_that_mirrors_the_wall_at_its_edge_is_not_cut_off():
+    """Schlick's reflectance of a ball whose picture is 40 pixels across: half of the light at its last half pixel."""
+    coverage = disc(19.0)
+    ticks = np.arange(40) + 0.5
+    from_middle = np.hypot(ticks[:, None] - 20.3, ticks - 19.8) / 19.0
+    mirrored = (1.0 - np.sqrt(np.maximum(1.0 - from_middle**2, 0.0))) ** 5
+    score = 0.12 * coverage * (1.0 - mirrored)
+    refined = at_half_coverage(coverage > 0.5, score, np.full((40, 40), 0.6), score > 0.005)
+    missed = ((coverage > 0.5) & ~refined).sum() / (2.0 * np.pi * 19.0)
+    assert missed < 0.26
+    assert not (refined & (coverage < 0.4)).any()
 
 
 def test_thin_parts_keep_their_edge():
