@@ -29,10 +29,8 @@ from hsi_sc_nerf.calibration.session_calibration import SessionCalibration
 from hsi_sc_nerf.capture.envi import Cube, CubeLines, open_cube
 from hsi_sc_nerf.capture.session import Capture, Session
 from hsi_sc_nerf.capture.session_info import SESSION_INFO_NAME
-from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import atomic_write, write_png
 from hsi_sc_nerf.packed.cube import write_packed_cube
-from hsi_sc_nerf.packed.dataset import is_packed, open_packed
 from hsi_sc_nerf.poses.session_pictures import GRAY_NM
 from hsi_sc_nerf.processing.foreground_score import smoothed_bins, spectral_bin_width
 from hsi_sc_nerf.spectra import bands_within, nearest_bands, to_8_bit
@@ -255,19 +253,6 @@ def session_fingerprint(session: Session, config: Any, files: Iterable[Path] = (
     # What is left out takes a place in the turn, unless it is a copy.
     places = [session.places] if session.damaged or session.excluded else []
     return fingerprint([session_files(session), settings, named, *places])
-
-
-def is_up_to_date(output_dir: Path, fingerprint: str) -> bool:
-    """Whether a folder holds a complete dataset that was made with this fingerprint."""
-    if not is_packed(output_dir):
-        return False
-    try:
-        dataset = open_packed(output_dir)
-        for frame in dataset.frames:
-            dataset.cube_of(frame)
-        return dataset.fingerprint == fingerprint
-    except InputError:  # an incomplete dataset is made again
-        return False
 
 
 def fingerprint(content: Any) -> str:

@@ -27,6 +27,9 @@ from hsi_sc_nerf.processing.frames import FramePaths
 
 _log = logging.getLogger(__name__)
 
+POSES_NAME = "poses.json"
+"""File of a dataset that says how its poses were found."""
+
 PoseFunction = Callable[..., TurntablePoses]
 """Called like ``poses.pose_methods.find_poses``."""
 
@@ -76,7 +79,7 @@ def pose_frames(
                 for name, frame in of_frames.items()
             },
         }
-    write_json(output_dir / "poses.json", report)
+    write_json(output_dir / POSES_NAME, report)
     draw_poses(poses, report, output_dir / "report" / "poses.png")
     console.print(f"Poses {poses.chosen}: {', '.join(describe_poses(poses, report))}.", highlight=False)
     if pictures is not None and poses.method == "markers":

@@ -33,10 +33,17 @@ from hsi_sc_nerf.poses.pose_methods import PoseMethod, find_poses
 from hsi_sc_nerf.processing.appearance_checks import check_appearance, check_band_order
 from hsi_sc_nerf.processing.chamber import background_spectrum
 from hsi_sc_nerf.processing.effects import draw_effects, measure_effects, points_of_object, show_effects
-from hsi_sc_nerf.processing.frames import BinsOfFrames, is_up_to_date, pack_frames, session_fingerprint
+from hsi_sc_nerf.processing.frames import BinsOfFrames, pack_frames, session_fingerprint
 from hsi_sc_nerf.processing.masks import MaskConfig
 from hsi_sc_nerf.processing.painted_masks import note_masks
-from hsi_sc_nerf.processing.posed_frames import PoseFunction, container_under, known_camera, pose_frames, posed_frames
+from hsi_sc_nerf.processing.posed_frames import (
+    POSES_NAME,
+    PoseFunction,
+    container_under,
+    known_camera,
+    pose_frames,
+    posed_frames,
+)
 from hsi_sc_nerf.processing.session_checks import SessionChecks, require_checks
 from hsi_sc_nerf.processing.session_masks import write_masks
 from hsi_sc_nerf.processing.visual_hull import assumed_disc, object_box, scene_box, size_in_words
@@ -121,7 +128,7 @@ def process_session(
 
     session = open_session(session_dir, exclude=config.exclude, skip_damaged=config.skip_damaged)
     fingerprint = _fingerprint(session, config)
-    if is_up_to_date(output_dir, fingerprint):
+    if _is_up_to_date(output_dir, fingerprint):
         console.print(f"{output_dir}: is up to date.")
         return output_dir
     camera = None if config.camera is None else known_camera(open_packed(config.camera))
@@ -241,7 +248,22 @@ def is_processed(session_dir: Path, output_dir: Path, config: ProcessConfig) -> 
         InputError: the session cannot be used.
     """
     session = open_session(session_dir, exclude=config.exclude, skip_damaged=config.skip_damaged)
-    return is_up_to_date(output_dir, _fingerprint(session, config))
+    return _is_up_to_date(output_dir, _fingerprint(session, config))
+
+
+def _is_up_to_date(output_dir: Path, fingerprint: str) -> bool:
+    """Whether a folder holds a complete dataset that was made with this fingerprint."""
+    if not is_packed(output_dir) or not all((output_dir / name).is_file() for name in (REPORT_NAME, POSES_NAME)):
+        return False
+    try:
+        dataset = open_packed(output_dir)
+        if dataset.fingerprint != fingerprint:
+            return False
+        for frame in dataset.frames:
+            dataset.cube_of(frame)
+    except InputError:  # an incomplete dataset is made again
+        return False
+    return True
 
 
 def _fingerprint(session: Session, config: ProcessConfig) -> str:

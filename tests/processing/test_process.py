@@ -328,6 +328,17 @@ def test_damaged_output_is_made_again(processed, lost):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("lost", ["calibration.json", "poses.json"])
+def test_a_lost_report_is_written_again_and_no_frame_is(processed, lost):
+    session, output = processed
+    before, told = written(output), (output / lost).read_bytes()
+    (output / lost).unlink()
+    run(session, output)
+    assert rewritten(output, before) == []
+    assert (output / lost).read_bytes() == told
+
+
+@pytest.mark.slow
 def test_a_stopped_run_goes_on(session, tmp_path):
     one_by_one = ProcessConfig(workers=1)
     in_the_way = tmp_path / "data" / "cubes" / "ball_3.bip"
