@@ -27,7 +27,7 @@ from hsi_sc_nerf.benchmark.configurations import (
     training_config,
 )
 from hsi_sc_nerf.benchmark.run import BenchmarkRun, Checkpoint, Job
-from hsi_sc_nerf.benchmark.steps import available_cores, describe_machine, run_step
+from hsi_sc_nerf.benchmark.steps import alone_in, available_cores, describe_machine, run_step
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import TEMPORARY_PREFIX, content_of, make_folder, read_json, write_json
 from hsi_sc_nerf.models.schedule import Clock
@@ -92,11 +92,20 @@ def train_all(configurations: Sequence[Configuration], command: BenchmarkCommand
     """Train the unfinished configurations and write all results after each.
 
     Raises:
-        InputError: a setting cannot be used, or runs failed; the others' results are written all the same.
+        InputError: a setting cannot be used, another command works in the folder, or runs failed; the others' results
+            are written all the same.
     """
     _check(configurations, command)
-    console = Console(stderr=True)
     data = _packed(command.data)
+    make_folder(command.output_dir)
+    with alone_in(command.output_dir):
+        return _train_missing(configurations, command, data)
+
+
+def _train_missing(
+    configurations: Sequence[Configuration], command: BenchmarkCommand, data: Path
+) -> list[BenchmarkRun]:
+    console = Console(stderr=True)
     machine = describe_machine()
     identity = {"machine": machine, "data_sha256": _data_sha256(data)}
     jobs = {configuration.name: _job(configuration, command, data) for configuration in configurations}

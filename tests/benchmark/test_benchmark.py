@@ -24,7 +24,7 @@ from hsi_sc_nerf.benchmark.configurations import (
 )
 from hsi_sc_nerf.benchmark.results import table, write_csv
 from hsi_sc_nerf.benchmark.run import BenchmarkRun, Checkpoint, HeldOutViews
-from hsi_sc_nerf.benchmark.steps import SPINS, run_step
+from hsi_sc_nerf.benchmark.steps import SPINS, alone_in, run_step
 from hsi_sc_nerf.cli import benchmark
 from hsi_sc_nerf.cli.benchmark import BenchmarkCommand
 from hsi_sc_nerf.errors import InputError
@@ -285,6 +285,12 @@ def test_a_failed_run_loses_only_itself(tiny_dataset, tmp_path, made_up):
         command(tiny_dataset, tmp_path).main()
     assert list((tmp_path / "ours").iterdir()) == []
     assert [r["name"] for r in json.loads((tmp_path / "benchmark.json").read_text())["runs"]] == ["no-normals"]
+
+
+def test_where_another_one_works_nothing_is_trained(tiny_dataset, tmp_path, made_up):
+    with alone_in(tmp_path), pytest.raises(InputError, match="another command works there"):
+        command(tiny_dataset, tmp_path).main()
+    assert made_up.names == []
 
 
 def test_results_of_earlier_calls_are_written_though_all_that_is_left_fails(tiny_dataset, tmp_path, made_up):
