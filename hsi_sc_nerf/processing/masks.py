@@ -37,8 +37,9 @@ CLOSING_FRACTION = 0.01
 
 COLUMNS, TILE_PX = 6, 240
 """Frames in a row of the contact sheet, and the width of each."""
-NEARBY_PX = 2.0
-"""Standard deviation of the Gaussian weights of averages over a pixel's neighbourhood."""
+NEARBY_PX, BESIDE_PX = 2.0, 1.0
+"""Standard deviations of the Gaussian weights of averages over a pixel's neighbourhood, and over what is beside shaded
+parts, where the light changes within few pixels."""
 LEAST_AT_EDGE, RING_PX = 0.5, 20
 """Smallest score at the edge, relative to the object near it; the fewest pixels of a ring that are measured."""
 GROWTH_PX = 2
@@ -47,6 +48,8 @@ GROWTH_PX = 2
 # darker pixels than the second have noisy ratios.
 _BRIGHT_BACKGROUND = 0.9
 _MIN_BRIGHTNESS = 0.1
+# Pixels with more than this fraction of the object's median ratio of score and brightness are all object.
+_SURE = 0.8
 _FACES = np.ones((3, 3), bool)
 
 
@@ -219,8 +222,13 @@ def shaded_parts(
         return np.zeros_like(body)
     typical = float(np.median(brightness[body]))
     relative = score / np.maximum(brightness, _MIN_BRIGHTNESS * typical)
-    least = fraction * np.median(relative[body])
-    least = least + (1.0 - min(fraction, 1.0)) * _nearby(relative, ~(body | (relative > least)))
+    median = np.median(relative[body])
+    # Its own light makes the object more coloured in its shade, and the lid the closer to it.
+    inside = np.maximum(_nearby(relative, body | (relative > _SURE * median)), median)
+    least = fraction * median
+    for _ in range(2):
+        outside = _nearby(relative, ~(body | (relative > least)), BESIDE_PX)
+        least = fraction * inside + (1.0 - min(fraction, 1.0)) * outside
     shaded = (relative > least) & (brightness < typical) & ~body
     if region is not None:
         shaded &= region
@@ -290,8 +298,10 @@ def _bright_behind(
     return _nearby(brightness, background) >= brightness
 
 
-def _nearby(image: Float[np.ndarray, "h w"], where: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+def _nearby(
+    image: Float[np.ndarray, "h w"], where: Bool[np.ndarray, "h w"], deviation_px: float = NEARBY_PX
+) -> Float[np.ndarray, "h w"]:
     """Weighted mean over the chosen pixels near each pixel; 0 where none is near."""
-    weight = cv2.GaussianBlur(where.astype(np.float32), (0, 0), NEARBY_PX)
-    total = cv2.GaussianBlur(np.where(where, image, 0.0).astype(np.float32), (0, 0), NEARBY_PX)
+    weight = cv2.GaussianBlur(where.astype(np.float32), (0, 0), deviation_px)
+    total = cv2.GaussianBlur(np.where(where, image, 0.0).astype(np.float32), (0, 0), deviation_px)
     return np.where(weight > 1e-4, total / np.maximum(weight, 1e-4), 0.0)
