@@ -38,8 +38,8 @@ CLOSING_FRACTION = 0.01
 COLUMNS, TILE_PX = 6, 240
 """Frames in a row of the contact sheet, and the width of each."""
 NEARBY_PX, BESIDE_PX = 2.0, 1.0
-"""Standard deviations of the Gaussian weights of averages over a pixel's neighbourhood, and over what is beside shaded
-parts, where the light changes within few pixels."""
+"""Standard deviations of the Gaussian weights of averages over a pixel's neighbourhood, and over what is beside
+shaded parts, where the light changes within few pixels."""
 LEAST_AT_EDGE, RING_PX = 0.5, 20
 """Smallest score at the edge, relative to the object near it; the fewest pixels of a ring that are measured."""
 GROWTH_PX = 2
