@@ -213,7 +213,7 @@ def shaded_parts(
     Args:
         region: pixels that may be the object's; all if not given.
         fraction: of the way from the ratio of score and brightness beside a pixel, where nothing can be the object's,
-            to the object's median ratio, from which a pixel belongs to it.
+            to the object's, from which a pixel belongs to it.
 
     Returns:
         The pixels to add, none where the background, of the frame and beside the pixel, is dark.
@@ -223,7 +223,7 @@ def shaded_parts(
     typical = float(np.median(brightness[body]))
     relative = score / np.maximum(brightness, _MIN_BRIGHTNESS * typical)
     median = np.median(relative[body])
-    # Its own light makes the object more coloured in its shade, and the lid the closer to it.
+    # Light from the object itself raises its ratio in its shade, and that of the lid close to it.
     inside = np.maximum(_nearby(relative, body | (relative > _SURE * median)), median)
     least = fraction * median
     for _ in range(2):

@@ -95,14 +95,18 @@ def test_mask_picture_draws_each_outline(tmp_path):
     assert not magenta[:180].any()
 
 
+def in_shade(folder, fruit, *effects):
+    """A small session in the chamber's uneven light, and its truth."""
+    scene = override(load_scene(fruit), frames=4, size_px=96, bands=12, effects=("chamber_shading", *effects))
+    session = simulate_session(scene, folder / "session", progress=False)
+    return session, load_truth(session)
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("blank_figures")
 def test_the_shaded_underside_is_the_objects(tmp_path):
-    """A simulated session in the chamber's uneven light, where the fruit's underside lies in its own shade."""
-    effects = ("photon_noise", "read_noise", "chamber_shading")
-    scene = override(load_scene("apple"), frames=4, size_px=96, bands=12, effects=effects)
-    session = simulate_session(scene, tmp_path / "session", progress=False)
-    truth = load_truth(session)
+    """Which lies in the fruit's own shade."""
+    session, truth = in_shade(tmp_path, "apple", "photon_noise", "read_noise")
 
     def mean_overlap(config):
         data = process_session(session, tmp_path / "data", ProcessConfig(masks=config), progress=False)
@@ -121,10 +125,7 @@ def test_the_shaded_underside_is_the_objects(tmp_path):
 @pytest.mark.usefixtures("blank_figures")
 def test_the_lid_in_the_light_of_a_fruit_is_not_the_objects(tmp_path):
     """Beside its base, the lid lies in the fruit's shade and gets a large part of its light from it."""
-    effects = ("chamber_shading", "inter_reflection", "photon_noise")
-    scene = override(load_scene("tomato"), frames=4, size_px=96, bands=12, effects=effects)
-    session = simulate_session(scene, tmp_path / "session", progress=False)
-    truth = load_truth(session)
+    session, truth = in_shade(tmp_path, "tomato", "inter_reflection", "photon_noise")
     too_much = length = 0.0
     for frame in open_packed(process_session(session, tmp_path / "data", progress=False)).frames:
         coverage = truth.object_coverage(frame.capture)
