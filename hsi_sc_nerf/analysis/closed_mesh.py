@@ -72,13 +72,15 @@ def surface_and_base(
         config: settings.
 
     Raises:
-        InputError: there are too few points, they lie in one place or too far apart, their normals do not point
-            outwards, or they end below the base.
+        InputError: there are too few points, they lie in one place or too far apart, they have no normals or such as
+            do not point outwards, or they end below the base.
     """
     if len(points_m) < NEIGHBOURS or np.ptp(points_m, axis=0).min() <= 0.0 or not np.isfinite(points_m).all():
         raise InputError(
             f"the cloud has {len(points_m)} points that do not surround a solid; export more points of the object."
         )
+    if unknown := np.count_nonzero(~np.isfinite(normals).all(axis=1)):
+        raise InputError(f"{unknown} of the cloud's points have no normal; take them away, or export the cloud again.")
     points, facing = np.asarray(points_m, float), np.asarray(normals, float)
     spacing_m, extent_m = config.smoothing_radius_m / _THINNING, float(np.ptp(points, axis=0).max())
     if extent_m > _MOST_CUBES * spacing_m:
