@@ -80,7 +80,7 @@ def surface_and_base(
             f"the cloud has {len(points_m)} points that do not surround a solid; export more points of the object."
         )
     if unknown := np.count_nonzero(~np.isfinite(normals).all(axis=1)):
-        raise InputError(f"{unknown} of the cloud's points have no normal; take them away, or export the cloud again.")
+        raise InputError(f"{unknown} of the cloud's points have no normal; take them away, or export it again.")
     points, facing = np.asarray(points_m, float), np.asarray(normals, float)
     spacing_m, extent_m = config.smoothing_radius_m / _THINNING, float(np.ptp(points, axis=0).max())
     if extent_m > _MOST_CUBES * spacing_m:

@@ -158,8 +158,8 @@ def _agreeing(rotations):
         return np.zeros(len(rotations), bool)
     axes = relative[turned] / size[turned, None]
     in_camera = np.einsum("pij,pj->pi", rotations[i[turned]], axes)
-    misfit = np.linalg.norm(np.einsum("nij,pj->pni", rotations, axes) - in_camera[:, None], axis=-1)
-    best = misfit[np.argmin(np.median(misfit, axis=1))]
+    pairs = zip(axes, in_camera, strict=True)
+    best = min((np.linalg.norm(rotations @ axis - image, axis=-1) for axis, image in pairs), key=np.median)
     return best <= max(np.deg2rad(_CONTRADICTS_DEG), _CONTRADICTS_MEDIANS * float(np.median(best)))
 
 
