@@ -99,6 +99,8 @@ def test_painted_masks_of_a_dataset_that_is_made_anew_have_no_box(tmp_path, caps
     fingerprint = session_fingerprint(open_session(session_dir), manager.dataparser.process)
     dataset = open_packed(write_ball_dataset(processed_dir(session_dir)))
     write_transforms(replace(dataset, fingerprint=fingerprint, metric=False))
+    for name in ("calibration.json", "poses.json"):  # without them it would not be whole
+        (dataset.root / name).write_text("{}")
     top_m = paint_stem(dataset)
     require_data(manager)
     assert manager.dataparser.object_box_m[1][2] > top_m
