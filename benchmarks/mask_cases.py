@@ -176,7 +176,7 @@ def _cells(session: Path, data: Path, mixed: bool) -> list[str]:
             coverage = truth.object_coverage(capture)
             covered = coverage > COVERED
             ious.append((mask & covered).sum() / (mask | covered).sum())
-            areas.append([_area_too_much(mask, coverage, part) for part in (1.0, LOWEST)])
+            areas.append([area_too_much(mask, coverage, part) for part in (1.0, LOWEST)])
     if not ious:
         return ["", "", "", "", refused]
     offsets = np.sum(areas, axis=0)
@@ -187,7 +187,7 @@ def _cells(session: Path, data: Path, mixed: bool) -> list[str]:
     ]
 
 
-def _area_too_much(
+def area_too_much(
     mask: Bool[np.ndarray, "h w"], coverage: Float[np.ndarray, "h w"], part: float
 ) -> tuple[float, int]:
     """How much larger the mask is than the object in a lower part of its image, and the pixels along the outline."""

@@ -69,13 +69,8 @@ def check_words(settings: SessionSettings, outs: Sequence[Path] = ()) -> None:
 
 def _require_trainable(words: Sequence[str]) -> None:
     """Refuse words that ns-train does not take; without any, its libraries need not be loaded."""
-    if not words:
-        return
-    config = cast("StagedTrainerConfig", training_config(OURS, words))
-    try:
-        config.plan()
-    except SystemExit as end:
-        raise InputError(str(end.code).removeprefix("hsi-sc-nerf: ")) from end
+    if words:
+        cast("StagedTrainerConfig", training_config(OURS, words)).plan()
 
 
 def _require_inputs_kept(settings: SessionSettings, out: Path) -> None:

@@ -90,29 +90,28 @@ class StagedTrainerConfig(TrainerConfig):
         """The stages of the run.
 
         Raises:
-            SystemExit: a setting is impossible, in one sentence.
+            InputError: a setting is impossible.
         """
         stages = (self.full_frame, self.masked)
-        with one_sentence():
-            check_options(self)
-            if self.machine.num_devices * self.machine.num_machines != 1:
-                # Rays and random numbers follow from the step, so all processes would train on the same rays;
-                # nerfstudio has not started them yet.
-                raise InputError(
-                    "a run trains on one device; leave --machine.num-devices and --machine.num-machines at 1, and "
-                    "give each GPU a session of its own (hsi-sc-nerf batch)."
-                )
-            for stage in stages:
-                stage.require_groups(self.optimizers)
-            timed = self.max_train_seconds is not None
-            return plan_stages(stages, self.max_train_seconds or self.max_num_iterations, timed)
+        check_options(self)
+        if self.machine.num_devices * self.machine.num_machines != 1:
+            # Rays and random numbers follow from the step, so all processes would train on the same rays;
+            # nerfstudio has not started them yet.
+            raise InputError(
+                "a run trains on one device; leave --machine.num-devices and --machine.num-machines at 1, and "
+                "give each GPU a session of its own (hsi-sc-nerf batch)."
+            )
+        for stage in stages:
+            stage.require_groups(self.optimizers)
+        timed = self.max_train_seconds is not None
+        return plan_stages(stages, self.max_train_seconds or self.max_num_iterations, timed)
 
     def save_config(self, checked: bool = False) -> None:
         """Check the settings unless that is done, and write ``config.yml``, the first file of a run, whole or not."""
-        self.plan()
-        path = self.get_base_dir() / "config.yml"
-        CONSOLE.log(f"Saving config to: {path}")
         with one_sentence(), interruption.one_line():
+            self.plan()
+            path = self.get_base_dir() / "config.yml"
+            CONSOLE.log(f"Saving config to: {path}")
             if not checked:
                 require_data(self.pipeline.datamanager)
                 resume_effects(self)
@@ -147,7 +146,8 @@ class StagedTrainer(Trainer):
         """Check the settings, plan the stages, and set up as nerfstudio does."""
         clock = self.config.train_clock if self.config.max_train_seconds else None
         wait = torch.cuda.synchronize if self.config.machine.device_type == "cuda" else None
-        self.schedule = Schedule(self.config.plan(), clock, wait)
+        with one_sentence():
+            self.schedule = Schedule(self.config.plan(), clock, wait)
         self._frozen: set[str] | None = None
         self._saved_step: int | None = None
         self._trained_step, self._steps_since_update = -1, 0

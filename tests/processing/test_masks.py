@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 from capture_factory import frame_reflectance, sphere_mask, true_pose
+from mask_cases import LOWEST, area_too_much
 from scipy import ndimage
 
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.morphology import beside
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.processing.foreground_score import smoothed_bins
 from hsi_sc_nerf.processing.masks import (
@@ -126,13 +126,9 @@ def test_the_shaded_underside_is_the_objects(tmp_path):
 def test_the_lid_in_the_light_of_a_fruit_is_not_the_objects(tmp_path):
     """Beside its base, the lid lies in the fruit's shade and gets a large part of its light from it."""
     session, truth = in_shade(tmp_path, "tomato", "inter_reflection", "photon_noise")
-    too_much = length = 0.0
-    for frame in open_packed(process_session(session, tmp_path / "data", progress=False)).frames:
-        coverage = truth.object_coverage(frame.capture)
-        lines = np.flatnonzero((coverage > 0.5).any(axis=1))
-        lowest = slice(round(lines[-1] - 0.1 * np.ptp(lines)), None)
-        too_much += (frame.mask() - coverage)[lowest].sum()
-        length += beside(coverage > 0.5, 1)[lowest].sum()
+    frames = open_packed(process_session(session, tmp_path / "data", progress=False)).frames
+    areas = [area_too_much(frame.mask(), truth.object_coverage(frame.capture), LOWEST) for frame in frames]
+    too_much, length = np.sum(areas, axis=0)
     assert abs(too_much / length) < 0.2
 
 
