@@ -1,11 +1,7 @@
 """Foreground masks: the object on its container, without chamber, container, disc and markers.
 
 Otsu's threshold separates the object's foreground scores from the others. What lies below the container's lid is
-excluded by geometry. The edge is decided locally: parts of the object in shade belong to it, and so do mixed pixels
-of which the object covers at least half. Light scales foreground score and brightness by the same factor, so their
-ratio depends on the material alone. The score of a mixed pixel lies between those of the object and of the
-background beside it, by its fraction of object. That of the background is not 0 where the object's light falls on it,
-as on the lid beside the base.
+excluded by geometry. The edge is decided locally (`mask_edges`).
 """
 
 from __future__ import annotations
@@ -17,13 +13,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.stats import median_abs_deviation
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.files import write_png
 from hsi_sc_nerf.morphology import components, dilate, draw_outline, ellipse_close_open, fill_holes, touching
 from hsi_sc_nerf.processing.foreground_score import background_subspace, foreground_score, otsu_threshold
+from hsi_sc_nerf.processing.mask_edges import GrownMask, half_covered_masks, shaded_parts
 from hsi_sc_nerf.settings_file import between
 
 MIN_CONTRAST = 0.005
@@ -37,20 +33,6 @@ CLOSING_FRACTION = 0.01
 
 COLUMNS, TILE_PX = 6, 240
 """Frames in a row of the contact sheet, and the width of each."""
-NEARBY_PX, BESIDE_PX = 2.0, 1.0
-"""Standard deviations of the Gaussian weights of averages over a pixel's neighbourhood, and over what is beside
-shaded parts, where the light changes within few pixels."""
-LEAST_AT_EDGE, RING_PX = 0.5, 20
-"""Smallest score at the edge, relative to the object near it; the fewest pixels of a ring that are measured."""
-GROWTH_PX = 2
-"""Pixels by which the edge may move outwards where the local score is low and the global threshold too high."""
-# Fractions of the object's median brightness: a background brighter than the first makes all mixed pixels bright;
-# darker pixels than the second have noisy ratios.
-_BRIGHT_BACKGROUND = 0.9
-_MIN_BRIGHTNESS = 0.1
-# Pixels with more than this fraction of the object's median ratio of score and brightness are all object.
-_SURE = 0.8
-_FACES = np.ones((3, 3), bool)
 
 
 @dataclass(frozen=True)
@@ -97,7 +79,7 @@ def foreground_masks(
     threshold = select_threshold(scores) if config.threshold is None else config.threshold
     lowest = _background_level(scores, threshold)
     weak_fraction = max(config.weak_fraction, min(1.0, lowest / threshold))
-    masks, left_out = [], []
+    left_out, frames = [], []
     for index, score in enumerate(scores):
         region = np.ones(score.shape, bool) if regions is None else regions[index]
         pieces = pieces_above(score, threshold, region)
@@ -108,8 +90,8 @@ def foreground_masks(
         if config.shaded_fraction is not None:
             shaded = shaded_parts(mask, score, brightness, region=may_grow, fraction=config.shaded_fraction)
             mask = fill_holes(mask | shaded)
-        masks.append(at_half_coverage(mask, score, brightness, may_grow))
-    return np.stack(masks), np.array(left_out)
+        frames.append(GrownMask(mask, score, brightness, may_grow))
+    return np.stack(half_covered_masks(frames)), np.array(left_out)
 
 
 def _background_level(scores: Sequence[Float[np.ndarray, "h w"]], threshold: float) -> float:
@@ -195,113 +177,3 @@ def mask_picture(
     rows = [tiles[i : i + COLUMNS] for i in range(0, len(tiles), COLUMNS)]
     rows[-1] += [blank] * (len(rows[0]) - len(rows[-1]))
     write_png(path, np.concatenate([np.concatenate(row, axis=1) for row in rows]))
-
-
-def shaded_parts(
-    body: Bool[np.ndarray, "h w"],
-    score: Float[np.ndarray, "h w"],
-    brightness: Float[np.ndarray, "h w"],
-    *,
-    region: Bool[np.ndarray, "h w"] | None = None,
-    fraction: float = 0.5,
-) -> Bool[np.ndarray, "h w"]:
-    """Pixels next to ``body`` that belong to it but get less light than most of it.
-
-    In front of a bright background the ratio of score and brightness of a mixed pixel is at most its fraction of
-    object times the object's ratio. In front of a dark one even a small fraction of object has the object's ratio.
-
-    Args:
-        region: pixels that may be the object's; all if not given.
-        fraction: of the way from the ratio of score and brightness beside a pixel, where nothing can be the object's,
-            to the object's, from which a pixel belongs to it.
-
-    Returns:
-        The pixels to add, none where the background, of the frame and beside the pixel, is dark.
-    """
-    if not body.any() or body.all():
-        return np.zeros_like(body)
-    typical = float(np.median(brightness[body]))
-    relative = score / np.maximum(brightness, _MIN_BRIGHTNESS * typical)
-    median = np.median(relative[body])
-    # Light from the object itself raises its ratio in its shade, and that of the lid close to it.
-    inside = np.maximum(_nearby(relative, body | (relative > _SURE * median)), median)
-    least = fraction * median
-    for _ in range(2):
-        outside = _nearby(relative, ~(body | (relative > least)), BESIDE_PX)
-        least = fraction * inside + (1.0 - min(fraction, 1.0)) * outside
-    shaded = (relative > least) & (brightness < typical) & ~body
-    if region is not None:
-        shaded &= region
-    shaded &= _bright_behind(brightness, body, ~(body | shaded))
-    return touching(shaded, dilate(body, 3), min_area_px=1)
-
-
-def at_half_coverage(
-    mask: Bool[np.ndarray, "h w"],
-    score: Float[np.ndarray, "h w"],
-    brightness: Float[np.ndarray, "h w"],
-    may_grow: Bool[np.ndarray, "h w"],
-) -> Bool[np.ndarray, "h w"]:
-    """The mask with its edge where pixels are half object, judged by the score of the object beside them.
-
-    Args:
-        brightness: brightness of one frame. A pixel in shade is kept: its score is low because it is dark.
-        may_grow: pixels that may be added.
-
-    Returns:
-        The mask, at most `GROWTH_PX` larger and one pixel smaller. Parts too thin to have an inside keep their edge.
-    """
-    if not mask.any():
-        return mask
-    for _ in range(GROWTH_PX):
-        half = _half_covered(score, mask)
-        rim = binary_dilation(mask, _FACES) & ~mask & may_grow
-        mask = fill_holes(mask | (rim & (half > 0.0) & (score > half)))
-    core = binary_erosion(mask, _FACES)
-    relative = score / np.maximum(brightness, 1e-3)
-    in_shade = (relative >= _half_covered(relative, mask)) & _bright_behind(brightness, mask, ~mask)
-    edge = binary_dilation(core, _FACES) & ~core
-    return fill_holes(mask & ~((score < _half_covered(score, mask)) & ~in_shade & edge))
-
-
-def _half_covered(image: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """What pixels that are half object and half background would have, by those near them; 0 far from the object."""
-    core = binary_erosion(mask, _FACES)
-    inside = _nearby(image, core)
-    inside *= _at_edge(np.divide(image, inside, out=np.ones_like(inside), where=inside > 0.0), core)
-    outside = _nearby(image, ~binary_dilation(mask, _FACES))
-    return (inside + np.minimum(outside, inside)) / 2.0
-
-
-def _at_edge(relative: Float[np.ndarray, "h w"], core: Bool[np.ndarray, "h w"]) -> float:
-    """The object's score at its edge, relative to that near it, by a parabola through the three outermost rings.
-
-    A glossy skin mirrors the chamber the more, the flatter it is looked at.
-    """
-    rings = []
-    for _ in range(3):
-        inner = binary_erosion(core, _FACES)
-        rings.append(relative[core & ~inner])
-        core = inner
-    if min(map(len, rings)) < RING_PX:
-        return 1.0
-    first, second, third = map(np.median, rings)
-    return float(np.clip(3.0 * first - 3.0 * second + third, LEAST_AT_EDGE, 1.0))
-
-
-def _bright_behind(
-    brightness: Float[np.ndarray, "h w"], body: Bool[np.ndarray, "h w"], background: Bool[np.ndarray, "h w"]
-) -> Bool[np.ndarray, "h w"]:
-    """Pixels that a mixture with the background beside them would not make darker; all before a bright background."""
-    if background.any() and np.median(brightness[~body]) >= _BRIGHT_BACKGROUND * np.median(brightness[body]):
-        return np.ones_like(body)
-    return _nearby(brightness, background) >= brightness
-
-
-def _nearby(
-    image: Float[np.ndarray, "h w"], where: Bool[np.ndarray, "h w"], deviation_px: float = NEARBY_PX
-) -> Float[np.ndarray, "h w"]:
-    """Weighted mean over the chosen pixels near each pixel; 0 where none is near."""
-    weight = cv2.GaussianBlur(where.astype(np.float32), (0, 0), deviation_px)
-    total = cv2.GaussianBlur(np.where(where, image, 0.0).astype(np.float32), (0, 0), deviation_px)
-    return np.where(weight > 1e-4, total / np.maximum(weight, 1e-4), 0.0)

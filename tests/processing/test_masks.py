@@ -10,15 +10,14 @@ from scipy import ndimage
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.packed.dataset import open_packed
 from hsi_sc_nerf.processing.foreground_score import smoothed_bins
+from hsi_sc_nerf.processing.mask_edges import at_half_coverage, glossy_edge, shaded_parts
 from hsi_sc_nerf.processing.masks import (
     MaskConfig,
-    at_half_coverage,
     foreground_mask,
     foreground_masks,
     mask_picture,
     pieces_above,
     select_threshold,
-    shaded_parts,
 )
 from hsi_sc_nerf.processing.process import ProcessConfig, process_session
 from hsi_sc_nerf.simulate.scene import load_scene, override
@@ -204,17 +203,28 @@ def test_the_edge_is_where_pixels_are_half_covered(dark_half, wall, bounced, off
     assert not (~refined & (coverage > 0.7)).any()
 
 
-def test_a_glossy_skin_that_mirrors_the_wall_at_its_edge_is_not_cut_off():
+@pytest.mark.parametrize(("coat", "shade"), [(1.0, 0.0), (0.6, 0.0), (1.0, 0.3), (0.0, 0.6), (0.0, 0.0)])
+def test_a_glossy_skin_that_mirrors_the_wall_at_its_edge_is_not_cut_off(coat, shade):
     """Schlick's reflectance of a ball whose picture is 40 pixels across: half of the light at its last half pixel."""
     coverage = disc(19.0)
     ticks = np.arange(40) + 0.5
     from_middle = np.hypot(ticks[:, None] - 20.3, ticks - 19.8) / 19.0
-    mirrored = (1.0 - np.sqrt(np.maximum(1.0 - from_middle**2, 0.0))) ** 5
-    score = 0.12 * coverage * (1.0 - mirrored)
-    refined = at_half_coverage(coverage > 0.5, score, np.full((40, 40), 0.6), score > 0.005)
-    missed = ((coverage > 0.5) & ~refined).sum() / (2.0 * np.pi * 19.0)
-    assert missed < 0.26
+    mirrored = coat * (1.0 - np.sqrt(np.maximum(1.0 - from_middle**2, 0.0))) ** 5
+    light = 1.0 - shade * np.minimum(from_middle, 1.0) ** 4  # less at the edge, also without gloss
+    score = 0.12 * light * coverage * (1.0 - mirrored)
+    bright = light * coverage * (0.4 * (1.0 - mirrored) + 0.8 * mirrored) + 0.8 * (1.0 - coverage)
+    mask = coverage > 0.5
+    leaves = glossy_edge(mask, score, bright)
+    assert leaves > 0.97 if coat == 0.0 else leaves < 0.8
+    refined = at_half_coverage(mask, score, bright, score > 0.005, leaves)
+    missed = (mask & ~refined).sum() / (2.0 * np.pi * 19.0)
+    assert missed < 0.1
     assert not (refined & (coverage < 0.4)).any()
+
+
+def test_no_gloss_is_told_from_less_than_three_rings():
+    assert np.isnan(glossy_edge(disc(4.0) > 0.5, disc(4.0), np.ones((40, 40))))
+    assert np.isnan(glossy_edge(np.zeros((40, 40), bool), np.zeros((40, 40)), np.ones((40, 40))))
 
 
 def test_thin_parts_keep_their_edge():
