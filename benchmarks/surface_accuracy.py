@@ -5,7 +5,8 @@
 
 F-scores are of what at least one camera sees. Precision is measured from the cloud to the true mesh, recall from true
 points to the nearest of many points of the cloud. Heights are signed distances of the cloud's points from the true
-surface, outside of it positive. The lowest centimetre is that of the true mesh.
+surface, outside of it positive. Normals are compared with those of the nearest triangles. The lowest centimetre is
+that of the true mesh.
 
 With exact depths, the run's depth maps are those of the true mesh. What is missed then, pixels and fusion miss.
 """
@@ -24,8 +25,9 @@ from open3d.core import Tensor
 from results_table import Benchmark, current_commit, write_results
 
 import hsi_sc_nerf
-from hsi_sc_nerf.evaluation.comparison import CompareConfig, read_surface
+from hsi_sc_nerf.evaluation.comparison import CompareConfig
 from hsi_sc_nerf.evaluation.spatial import Surface, sample_surface, score_at
+from hsi_sc_nerf.export.cloud import read_spectral_ply
 from hsi_sc_nerf.export.options import CloudOptions
 from hsi_sc_nerf.export.spectral_export import export_cloud
 from hsi_sc_nerf.geometry.mesh import Mesh, ray_scene
@@ -50,6 +52,8 @@ COLUMNS = (
     "16 to 84 % of points, mm",
     "lowest centimetre: recall at 0.5 mm, %",
     "its height, mm",
+    "error of normals, median, deg",
+    "90 %",
 )
 
 
@@ -70,13 +74,15 @@ class SurfaceAccuracy(Benchmark):
         """Export, measure, print the table, write the row."""
         mesh = load_truth(self.session).mesh()
         run = open_trained_run(self.load_config)
-        cloud_m = fused_exact_depths(run, mesh) if self.exact_depths else exported(run)
+        cloud_m, normals = fused_exact_depths(run, mesh) if self.exact_depths else exported(run)
         reference = true_reference(self.session, CompareConfig(whole_reference=False))
         assert reference.seen is not None
         seen_m = reference.surface.points_m[reference.seen]
         # Open3D's signed distance is positive outside.
         scene = ray_scene(mesh.vertices, mesh.triangles)
         heights_m = scene.compute_signed_distance(Tensor(cloud_m.astype(np.float32))).numpy().astype(float)
+        nearest = scene.compute_closest_points(Tensor(cloud_m.astype(np.float32)))["primitive_normals"].numpy()
+        off_deg = np.rad2deg(np.arccos(np.clip((nearest * normals).sum(axis=1), -1.0, 1.0)))
         to_cloud_m = Surface(cloud_m).distances_m(seen_m)
         scores = [score_at(np.abs(heights_m), to_cloud_m, threshold_m) for threshold_m in THRESHOLDS_M]
         low, middle, high = 1e3 * np.percentile(heights_m, [16, 50, 84])
@@ -86,19 +92,21 @@ class SurfaceAccuracy(Benchmark):
         cells += [f"{scores[-1].precision:.1f}", f"{scores[-1].recall:.1f}"]
         cells += [f"{middle:+.2f}", f"{low:+.2f} to {high:+.2f}"]
         cells += [f"{100.0 * lowest.mean():.1f}", f"{1e3 * np.median(heights_m[cloud_m[:, 2] < end_m]):+.2f}"]
+        cells += [f"{degrees:.1f}" for degrees in np.percentile(off_deg, [50, 90])]
         commit = current_commit(Path(hsi_sc_nerf.__file__).parent)
         write_results("surface_accuracy", COLUMNS, [cells], keys=1, commit=commit, folder=self.results)
 
 
-def exported(run: TrainedRun) -> Float[np.ndarray, "n 3"]:
-    """Points of the run's cloud, metres."""
+def exported(run: TrainedRun) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Points of the run's cloud, metres, and their normals."""
     with TemporaryDirectory() as folder:
-        return read_surface(export_cloud(run, Path(folder), CloudOptions(num_points=POINTS, bands=BANDS)))[0]
+        cloud = read_spectral_ply(export_cloud(run, Path(folder), CloudOptions(num_points=POINTS, bands=BANDS)))
+    return cloud.points.astype(float), cloud.normals
 
 
 @torch.no_grad()
-def fused_exact_depths(run: TrainedRun, mesh: Mesh) -> Float[np.ndarray, "n 3"]:
-    """Points, in metres, of the fusion of the true mesh's depths in the middles of the run's cells."""
+def fused_exact_depths(run: TrainedRun, mesh: Mesh) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Points, in metres, and normals of the fusion of the true mesh's depths in the middles of the run's cells."""
     dataset = run.manager.train_dataset
     renders = render_depth_maps(run.model, dataset.cameras, run.manager.train_pixel_sampler.masks, 4096)
     renders = with_exact_depths(run, renders, mesh)
@@ -106,10 +114,10 @@ def fused_exact_depths(run: TrainedRun, mesh: Mesh) -> Float[np.ndarray, "n 3"]:
     fused = tsdf_fusion(renders, box)
     assert fused is not None
     points = sample_surface(fused.vertices, fused.triangles, POINTS, seed=0)
-    normals = torch.from_numpy(fused.normals_at(points)).float()
-    seen = renders.most_frontal(torch.from_numpy(points).float(), normals)[0].numpy() >= 0
-    origin, unit = run.to_scene(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
-    return (points[seen & ((points >= box[0]) & (points <= box[1])).all(axis=1)] - origin) / (unit - origin)[0]
+    normals = fused.normals_at(points)
+    seen = renders.most_frontal(*(torch.from_numpy(array).float() for array in (points, normals)))[0].numpy() >= 0
+    kept = seen & ((points >= box[0]) & (points <= box[1])).all(axis=1)
+    return run.to_metres(points[kept]), normals[kept]
 
 
 def with_exact_depths(run: TrainedRun, renders: DepthRenders, mesh: Mesh) -> DepthRenders:

@@ -52,7 +52,7 @@ class CloudOptions:
     std_ratio: float = between(1e-6, 1e6, default=10.0)
     """How many standard deviations above the average distance make an outlier."""
     normal_method: Literal["open3d", "model_output"] = "model_output"
-    """Normals from neighbouring points (open3d), or from the gradient of the model's density."""
+    """Normals of the model's surface (model_output), or from neighbouring points (open3d)."""
     obb_center: tuple[float, float, float] | None = between(-1e6, 1e6, default=None)
     """Centre of an oriented box to crop to, in nerfstudio's scene units; needs all three obb options."""
     obb_rotation: tuple[float, float, float] | None = between(-1e6, 1e6, default=None)

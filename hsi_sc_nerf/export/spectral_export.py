@@ -12,7 +12,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
-from torch.nn import functional
 
 from hsi_sc_nerf.errors import InputError
 from hsi_sc_nerf.export.cloud import (
@@ -26,7 +25,6 @@ from hsi_sc_nerf.export.cloud import (
 from hsi_sc_nerf.export.formats import require_format, write_cloud
 from hsi_sc_nerf.export.options import CloudOptions, select_bands
 from hsi_sc_nerf.files import require_writable
-from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.spectra import to_8_bit
 from hsi_sc_nerf.surface.depth_renders import DepthRenders, render_depth_maps
@@ -100,10 +98,10 @@ def render_cloud(run: TrainedRun, options: CloudOptions, name: str = "") -> Clou
         surface = surface.select(statistical_inliers(surface.points, options.std_ratio))
         if not len(surface):
             raise InputError("every point counts as an outlier; give a larger --std-ratio.")
-    normals = None
+    normals = surface.mesh_normals
     if options.normal_method == "open3d":
-        normals = estimate_normals(surface.points, surface.mesh_normals).astype(np.float32)
-    chunks = _render_chunks(run, renders, surface, normals, bands, batch)
+        normals = estimate_normals(surface.points, normals)
+    chunks = _render_chunks(run, renders, surface, normals.astype(np.float32), bands, batch)
     return CloudStream(len(surface), run.model.wavelengths_nm[bands], EXTRA, chunks, name, run.dataset.metric)
 
 
@@ -130,25 +128,25 @@ def _render_chunks(
     run: TrainedRun,
     renders: DepthRenders,
     surface: SurfacePoints,
-    normals: Float[np.ndarray, "n 3"] | None,
+    normals: Float[np.ndarray, "n 3"],
     bands: Int[np.ndarray, "selected"],
     batch: int,
 ) -> Iterator[SpectralCloud]:
-    """The cloud's chunks, each rendered when it is written; without ``normals`` they are the density's."""
+    """The cloud's chunks, each rendered when it is written."""
     frames, reader = run.manager.train_dataset.frames, run.manager.train_pixel_sampler.reader
     flags = np.stack([frame.flags() for frame in frames]) if run.dataset.flagged_values else None
     with progress_bar("rendering spectra", "points", len(surface)) as update:
         for start in range(0, len(surface), CHUNK_POINTS):
             chunk = surface.select(slice(start, start + CHUNK_POINTS))
             parts = [_render_points(run, chunk.select(slice(i, i + batch))) for i in range(0, len(chunk), batch)]
-            spectra, opacity, own_normals = (np.concatenate(column) for column in zip(*parts, strict=True))
+            spectra, opacity = (np.concatenate(column) for column in zip(*parts, strict=True))
             points, outward = (
                 torch.from_numpy(array).float().to(run.model.device) for array in (chunk.points, chunk.mesh_normals)
             )
             statistics = view_statistics(points, outward, spectra[:, bands], bands, renders, reader, flags)
             yield SpectralCloud(
                 run.to_metres(chunk.points).astype(np.float32),
-                own_normals if normals is None else normals[start : start + CHUNK_POINTS],
+                normals[start : start + CHUNK_POINTS],
                 to_8_bit(spectra[:, run.model.rgb_bands]),
                 spectra[:, bands],
                 run.model.wavelengths_nm[bands],
@@ -160,18 +158,8 @@ def _render_chunks(
 @torch.no_grad()
 def _render_points(
     run: TrainedRun, surface: SurfacePoints
-) -> tuple[Float[np.ndarray, "n bands"], Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
-    """The object's reflectance along the ray of each point, the ray's opacity, unit normals towards the camera."""
-    model = run.model
-    rays = camera_rays(run.manager.train_dataset.cameras, surface.frames, surface.xy_px, model.device)
-    outputs, spectra = render_object(model, rays)
-    normals = density_normals(model, surface.points)
-    away = (normals * rays.directions).sum(dim=-1, keepdim=True) > 0.0
-    normals = torch.where(away, -normals, normals)
-    return spectra.cpu().numpy(), outputs["accumulation"][:, 0].cpu().numpy(), normals.cpu().numpy()
-
-
-def density_normals(model: SpectralModel, points: Float[np.ndarray, "n 3"]) -> Float[torch.Tensor, "n 3"]:
-    """Unit normals out of a model's surface at points of the scene, by the gradient of its density."""
-    positions = torch.from_numpy(points).float().to(model.device)
-    return -functional.normalize(model.field.density_gradient(positions), dim=-1)
+) -> tuple[Float[np.ndarray, "n bands"], Float[np.ndarray, "n"]]:
+    """The object's reflectance along the ray of each point, and the ray's opacity."""
+    rays = camera_rays(run.manager.train_dataset.cameras, surface.frames, surface.xy_px, run.model.device)
+    outputs, spectra = render_object(run.model, rays)
+    return spectra.cpu().numpy(), outputs["accumulation"][:, 0].cpu().numpy()
