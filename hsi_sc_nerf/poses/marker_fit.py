@@ -19,8 +19,8 @@ from hsi_sc_nerf.robust_scatter import robust_std
 
 # Of the paper around the marker this much is taken into the fit, in cells.
 _MARGIN_CELLS = 0.7
-# Blur mixes in the surroundings of the paper: the margin is narrower by this many standard deviations of the blur,
-# down to a least one.
+# Pixels and blur mix in what is around the paper: the margin is narrower by half a pixel and by this many standard
+# deviations of the blur, down to a least one.
 _BLUR_MARGIN = 1.5
 _LEAST_MARGIN_CELLS = 0.2
 # The pattern's edges are ramps one texel wide: half a pixel, where a cell has more than a few pixels.
@@ -145,7 +145,7 @@ def _window(corners_px, cells, blur_px, shape):
     """First pixel (x, y) of a box around the marker and which of its pixels the fit takes; None outside the image."""
     to_image = cv2.getPerspectiveTransform(_unit_square(cells), corners_px.astype(np.float32))
     cell_px = np.sqrt(quad_area(corners_px)) / cells
-    margin = max(_LEAST_MARGIN_CELLS, _MARGIN_CELLS - _BLUR_MARGIN * blur_px / cell_px)
+    margin = max(_LEAST_MARGIN_CELLS, _MARGIN_CELLS - (0.5 + _BLUR_MARGIN * blur_px) / cell_px)
     low, high = -margin, cells + margin
     outline = np.array([[[low, low], [high, low], [high, high], [low, high]]], np.float64)
     outline = cv2.perspectiveTransform(outline, to_image)[0]

@@ -6,7 +6,12 @@ import pytest
 from turntable_scene import MarkerScene
 
 from hsi_sc_nerf.geometry.camera import project
-from hsi_sc_nerf.poses.marker_detection import detect_markers, dictionary_by_name, find_dictionary
+from hsi_sc_nerf.poses.marker_detection import (
+    detect_markers,
+    dictionary_by_name,
+    find_dictionary,
+    marker_pattern,
+)
 from hsi_sc_nerf.poses.marker_fit import fit_marker
 from hsi_sc_nerf.poses.marker_observations import find_blur
 
@@ -106,6 +111,26 @@ def test_fit_does_not_mind_shade_that_bends_over_the_marker(small):
                 shifts_px.append(np.abs(shaded.corners_px - here.corners_px).max())
     assert len(shifts_px) >= 8
     assert max(shifts_px) < 0.05
+
+
+@pytest.mark.parametrize("around", [0.78, 0.6])
+def test_what_lies_beside_a_narrow_paper_does_not_shift_the_edges(around):
+    """Small markers on paper whose border is 0.7 cells wide; pixels at its edge show what lies beside it."""
+    over, middle, ratios = 8, 20.0, []
+    grid = (np.arange(2 * middle * over) + 0.5) / over
+    x, y = np.meshgrid(grid - middle, grid - middle)
+    for number, angle in enumerate(np.linspace(0.0, 1.5, 30)):
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        u, v = 7 / 15 * np.tensordot(turn.T, [x, y], 1)
+        reach = np.maximum(np.abs(u), np.abs(v))
+        image, ink = np.where(reach < 4.2, 0.9, around), reach < 3.5
+        image[ink] = np.where(
+            marker_pattern(DICTIONARY, number)[tuple((np.array([v, u])[:, ink] + 3.5).astype(int))], 0.9, 0.05
+        )
+        truth = middle + 7.5 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ turn.T
+        image = 220.0 * image.reshape(40, over, 40, over).mean(axis=(1, 3))
+        ratios.append(side(fit_marker(image, DICTIONARY, number, truth).corners_px) / side(truth))
+    assert np.mean(ratios) == pytest.approx(1.0, abs=5e-4)
 
 
 def test_fit_refuses_another_marker_and_the_images_edge(small):
