@@ -97,8 +97,7 @@ def find_markers(session: Session, quicklooks: Sequence[Quicklook]) -> Markers:
     for number in np.unique(np.linspace(0, max(len(seen) - 1, 0), FITTED_MARKERS).astype(int))[: len(seen)].tolist():
         index, marker, corners = seen[number]
         assert dictionary is not None
-        image = quicklooks[index].picture.mean(axis=-1).astype(float)
-        fit = fit_marker(image, dictionary, marker, corners)
+        fit = fit_marker(grays[index].astype(float), dictionary, marker, corners)
         if fit is not None:
             errors.append(float(np.sqrt(np.diag(fit.covariance_px2).mean())))
     markers = Markers(

@@ -3,9 +3,14 @@
 import numpy as np
 import pytest
 from exact_turntable import marker_observations, marker_turntable
+from inspection_session import SIZE_PX as SESSION_PX
 from turntable_scene import MarkerScene
 
-from hsi_sc_nerf.inspection.marker_checks import Markers, turn_and_rotation_deg
+from hsi_sc_nerf.capture.session import open_session
+from hsi_sc_nerf.geometry.camera import project
+from hsi_sc_nerf.inspection.marker_checks import Markers, find_markers, turn_and_rotation_deg
+from hsi_sc_nerf.inspection.quicklook import quicklooks_of
+from hsi_sc_nerf.poses.marker_fit import fit_marker
 
 SIZE_PX = 256
 
@@ -73,3 +78,19 @@ def test_a_frame_that_shares_no_marker_has_no_angle():
 def test_a_usual_step_is_one_that_many_frames_share(angles_deg, usual_deg):
     found = Markers("DICT_5X5_50", [{}] * 7, np.array(angles_deg, float), 0, 20.0, 0.1)
     assert found.usual_step_deg == usual_deg
+
+
+def test_the_stated_error_of_corners_is_their_distance_from_the_truth(good):
+    session = open_session(good)
+    quicklooks = quicklooks_of(session)
+    markers = find_markers(session, quicklooks)
+    scene = MarkerScene(size_px=SESSION_PX, frames=len(quicklooks), target_height_m=0.08)
+    errors_px = []
+    for quicklook, seen, pose in zip(quicklooks, markers.detections, scene.camera_to_world, strict=True):
+        for marker, corners in seen.items():
+            fit = fit_marker(quicklook.gray.astype(float), "DICT_5X5_50", marker, corners)
+            if fit is not None:
+                true_px, _ = project(scene.corners_m[marker], pose, scene.intrinsics)
+                errors_px.append(fit.corners_px - true_px)
+    assert len(errors_px) > 20
+    assert markers.corner_error_px == pytest.approx(np.sqrt(np.mean(np.square(errors_px))), rel=0.5)
