@@ -258,7 +258,7 @@ def check_calibration(session: Session, calibration: SessionCalibration) -> list
 
 
 def check_clipped(session: Session, calibration: SessionCalibration, counts: PixelCounts, pixels: int) -> Finding:
-    """The finding ``clipped``: the fractions of values that were clipped at the upper bound or are saturated.
+    """The finding ``clipped``: values that were clipped at the upper bound or are saturated, in frames or white.
 
     Args:
         session: its bands.
@@ -270,17 +270,24 @@ def check_clipped(session: Session, calibration: SessionCalibration, counts: Pix
     worst = int(by_band.argmax())
     worst_nm = float(session.wavelengths_nm[calibration.bands[worst]])
     clipped = float(counts.clipped_high.mean() / pixels)
-    values = {"clipped": clipped, "saturated": float(by_band[worst]), "saturated_nm": worst_nm}
+    lost_nm: list[float] = []
+    if calibration.defects is not None:
+        explained = np.union1d(calibration.bands, np.flatnonzero(calibration.defects.bad_bands))
+        lost_nm = np.delete(session.wavelengths_nm, explained).tolist()
+    values = {"clipped": clipped, "saturated": float(by_band[worst]), "saturated_nm": worst_nm, "lost_nm": lost_nm}
     of_a_band = f"at most {100.0 * by_band[worst]:.2g} % of a band ({worst_nm:.0f} nm) are"
     text = (
         f"{100.0 * clipped:.2g} % of the values are clipped at the upper bound, and "
         f"{of_a_band if by_band[worst] else 'none is'} saturated"
     )
+    if lost_nm:
+        span = f"{lost_nm[0]:.0f} to {lost_nm[-1]:.0f} nm"
+        text += f"; {len(lost_nm)} bands ({span}) are left out, because the white saturates in them"
     if clipped > CLIPPED_RED or by_band[worst] > SATURATED_RED:
         return Finding("clipped", "red", f"{session.path}: {text}; check the white and the integration time.", values)
-    if clipped > CLIPPED_AMBER or by_band[worst] > SATURATED_AMBER:
+    if clipped > CLIPPED_AMBER or by_band[worst] > SATURATED_AMBER or lost_nm:
         advice = "a shorter integration time avoids it"
-        if not by_band[worst] > SATURATED_AMBER:  # clipped readings are not saturated, and as bright by any exposure
+        if not (by_band[worst] > SATURATED_AMBER or lost_nm):  # clipped readings are as bright by any exposure
             advice = "check the white, or raise the upper bound with --calibration.bounds"
         return Finding("clipped", "amber", f"{session.path}: {text}; {advice}.", values)
     return Finding("clipped", "green", f"Values: {text}.", values)

@@ -75,6 +75,24 @@ def test_clipped(calibrated, clipped, saturated, level):
         assert ("bounds" in finding.sentence, "integration time" in finding.sentence) == (clipped > 0, saturated > 0)
 
 
+def test_bands_in_which_the_white_saturates_are_named_and_not_lost_in_silence(tmp_path):
+    """White and frames of a detector of 12 bits, exposed for a tenth longer."""
+    session = open_session(write_session(tmp_path))
+    for capture in (session.white, *session.frames):
+        assert capture is not None
+        counts = np.asarray(capture.cube.memmap()).astype(int)
+        write_capture(tmp_path, capture.name, np.clip(1.1 * counts, 0, 4095).astype(np.uint16))
+    session = open_session(tmp_path)
+    calibration = calibrate_session(session, CalibrationConfig())
+    lost_nm = np.delete(WAVELENGTHS_NM, calibration.bands)
+    assert len(lost_nm) == 3
+    none = np.zeros(len(calibration.bands), int)
+    finding = check_clipped(session, calibration, PixelCounts(none, none, none, none, none), 1000)
+    assert finding.level == "amber"
+    assert f"3 bands ({lost_nm[0]:.0f} to {lost_nm[-1]:.0f} nm) are left out" in finding.sentence
+    assert finding.values["lost_nm"] == lost_nm.tolist()
+
+
 @pytest.mark.parametrize(
     ("slope", "measured", "scatter", "level"),
     [
