@@ -44,7 +44,7 @@ _ROUNDING = 1e-6
 """A smaller standard deviation, as a fraction of the value, is that of single precision."""
 _MAP_NOTE = (
     "Mean ± standard deviation over the surface, weighted by area; in brackets, where it is known, the standard "
-    "deviation of the mean, by how much frames disagree."
+    "deviation of the mean, by how much frames disagree and by what pixels mix."
 )
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.analysis.class_maps import ClassAreas, ClassMap, class_areas
@@ -121,8 +122,8 @@ class MapMean:
 
     Attributes:
         surface: mean and standard deviation over the surface.
-        std: standard deviation of the mean, by how much frames disagree and by what the map itself errs; NaN where it
-            is not known.
+        std: standard deviation of the mean, by how much frames disagree, what pixels mix, and by what the map itself
+            errs; NaN where it is not known.
         outside: fraction of the area that was not counted, because no value is known of it.
     """
 
@@ -206,16 +207,18 @@ def analyse(
         areas_m2 = surface.areas_m2[where]
         spectrum, light = region_spectrum(surface, where), _light(surface, where)
         noise = _noise_std(surface, where, pixel_m, light)
-        std = math.nan
+        std, blurred = math.nan, None
         if pixel_m is not None and not math.isnan(noise):
             # By how much frames disagree over the region's pixels, what they mix, and what is known of its light.
+            blurred = _blurred(surface, where, pixel_m)
+            mixed = weighted_mean_and_sd(blurred.mean(axis=1), areas_m2).mean - spectrum.mean.mean()
             shared = 0.0 if light is None else spectrum.mean.mean() * light.irradiance_std / light.irradiance.mean
-            std = math.hypot(noise, _mixed(surface, where, pixel_m), shared)
+            std = math.hypot(noise, mixed, shared)
         return RegionTraits(
             name,
             float(areas_m2.sum()),
             spectrum,
-            {one.name: _map_mean(one, where, surface, spectrum, noise) for one in maps},
+            {one.name: _map_mean(one, where, surface, spectrum, noise, blurred) for one in maps},
             std,
             light,
             {one.name: class_areas(one, where, surface, pixel_m) for one in class_maps},
@@ -245,24 +248,30 @@ def _noise_std(
 
 
 def _map_mean(
-    one: SurfaceMap, chosen: Bool[np.ndarray, "v"], surface: SpectralMesh, spectrum: MeanAndSd, noise: float
+    one: SurfaceMap,
+    chosen: Bool[np.ndarray, "v"],
+    surface: SpectralMesh,
+    spectrum: MeanAndSd,
+    noise: float,
+    blurred: Float[np.ndarray, "chosen bands"] | None,
 ) -> MapMean:
     """The mean of a map over the chosen vertices; its noise is that of the region's mean spectrum."""
     values, areas_m2 = one.values[chosen], surface.areas_m2[chosen]
     std = math.hypot(propagated_std(one.of, spectrum.mean, noise), one.error)
+    if blurred is not None:
+        std = math.hypot(std, weighted_mean_and_sd(one.of(blurred) - values, areas_m2).mean)
     undefined = float(areas_m2[np.isnan(values)].sum() / areas_m2.sum())
     return MapMean(weighted_mean_and_sd(values, areas_m2), std, undefined)
 
 
-def _mixed(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"], pixel_m: float) -> float:
-    """Change of a region's mean reflectance by one more blur over a pixel: what pixels mixed, they mix again."""
-    brightness, areas_m2 = surface.spectra.mean(axis=1), surface.areas_m2
+def _blurred(
+    surface: SpectralMesh, chosen: Bool[np.ndarray, "v"], pixel_m: float
+) -> Float[np.ndarray, "chosen bands"]:
+    """The chosen vertices' spectra after one more blur over a pixel: what pixels mixed, they mix again."""
     at, neighbours = (surface.mesh.vertices[where] for where in (chosen, surface.seen))
     pairs = cKDTree(at).sparse_distance_matrix(cKDTree(neighbours), pixel_m, output_type="coo_matrix")
-    weight = areas_m2[surface.seen][pairs.col]
-    total = np.bincount(pairs.row, weight, minlength=len(at))
-    blurred = np.bincount(pairs.row, weight * brightness[surface.seen][pairs.col], minlength=len(at)) / total
-    return float(areas_m2[chosen] @ (blurred - brightness[chosen]) / areas_m2[chosen].sum())
+    weight = coo_array((surface.areas_m2[surface.seen][pairs.col], (pairs.row, pairs.col)), pairs.shape).tocsr()
+    return (weight @ surface.spectra[surface.seen].astype(float)) / weight.sum(axis=1)[:, None]
 
 
 def _light(surface: SpectralMesh, chosen: Bool[np.ndarray, "v"]) -> RegionLight | None:

@@ -176,9 +176,13 @@ def test_a_region_at_the_edge_of_two_materials_is_uncertain_by_what_pixels_mix(i
         RegionOfInterest(name, (x_m, y_m, 0.02), 0.003)
         for name, x_m, y_m in (("in", 0.0, 0.02), ("edge", 0.0198, 0.003))
     ]
-    _, inside, edge = analyse(surface, spots, pixel_m=0.002).regions
+    maps = index_maps(surface, find_indices(["own = R700 - R600"], NM))
+    _, inside, edge = analyse(surface, spots, pixel_m=0.002, maps=maps).regions
     assert inside.reflectance_std == pytest.approx(0.0, abs=1e-6)
+    assert inside.maps["own"].std == pytest.approx(0.0, abs=1e-6)
     assert edge.reflectance_std == pytest.approx(0.08 * (GREEN.mean() - 0.5 * BROWN.mean()), rel=0.02)
+    green, brown = (maps[0].of(one[None])[0] for one in (GREEN, 0.5 * BROWN))
+    assert edge.maps["own"].std == pytest.approx(0.08 * abs(green - brown), rel=0.02)
 
 
 def test_the_mean_of_a_region_scatters_as_its_pixels_and_shares_its_light():
