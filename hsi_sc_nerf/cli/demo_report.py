@@ -124,7 +124,7 @@ def _draw_marked_spectra(path: Path, dataset: PackedDataset, points: np.ndarray,
     """Draw spectra of the cloud at some pixels of the first frame beside the measured ones."""
     frame = dataset.frames[0]
     pixels = _spread_pixels(frame.mask(), MARKED_POINTS)
-    image_points, depth = project(points, frame.camera_to_world, dataset.intrinsics)
+    image_points, depth = project(points, frame.camera_to_world, dataset.intrinsics, dataset.distortion)
     tree = cKDTree(image_points)
     seen = []
     for pixel in pixels:

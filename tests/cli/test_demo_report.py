@@ -1,14 +1,18 @@
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import cv2
 import matplotlib as mpl
 import numpy as np
 import pytest
 from PIL import Image
 
+from hsi_sc_nerf.cli import demo_report
 from hsi_sc_nerf.cli.demo_report import draw_cloud, draw_spectra, draw_views
 from hsi_sc_nerf.errors import InputError
+from hsi_sc_nerf.geometry.camera import OPENCV_TO_OPENGL, PinholeIntrinsics
 
 WAVELENGTHS = np.linspace(400.0, 1000.0, 7)
 RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
@@ -53,6 +57,26 @@ def test_marked_points_lie_where_their_pixels_are(tmp_path: Path) -> None:
         row, column = (marks.max(0) + marks.min(0)) / 2
         assert (column - left) / (right - left) * 30 == pytest.approx(x, abs=0.3)
         assert (row - top) / (bottom - top) * 20 == pytest.approx(y, abs=0.3)
+
+
+def test_a_marked_pixel_has_the_spectrum_of_the_points_that_the_lens_shows_there(monkeypatch) -> None:
+    camera, distortion = PinholeIntrinsics(128, 128, 230.0, 230.0, 64.0, 64.0), np.array([-0.9, 0.0, 0.0, 0.0])
+    x, y = (axis.ravel() for axis in np.meshgrid(*2 * [np.linspace(-0.2, 0.2, 400)]))
+    points = np.stack([x, y, np.full_like(x, 0.5)], axis=-1)  # before a camera at the origin that looks along z
+    shown = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.matrix(), distortion)[0][:, 0]
+    frame = SimpleNamespace(
+        mask=lambda: np.ones((128, 128), bool),
+        cube=lambda: np.zeros((128, 128, 7), np.uint16),
+        pseudo_rgb=lambda: np.zeros((128, 128, 3), np.uint8),
+        camera_to_world=OPENCV_TO_OPENGL,
+    )
+    dataset = SimpleNamespace(frames=[frame], intrinsics=camera, distortion=distortion, wavelengths_nm=WAVELENGTHS)
+    drawn = []
+    monkeypatch.setattr(demo_report, "draw_spectra", lambda *given: drawn.append(given))
+    # The first band of a point's spectrum is the column that shows it, the others the line.
+    demo_report._draw_marked_spectra(Path("spectra.png"), dataset, points, shown[:, [0] + [1] * 6])
+    ((_, _, _, reconstructed, *_, pixels),) = drawn
+    np.testing.assert_allclose(reconstructed[:, :2], pixels, atol=0.3)
 
 
 @pytest.mark.slow
