@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
 
 from hsi_sc_nerf.api.clouds import Cloud
@@ -18,6 +17,7 @@ from hsi_sc_nerf.export.cloud_material import require_bands_of_run, with_materia
 from hsi_sc_nerf.export.options import CloudOptions
 from hsi_sc_nerf.export.sample_points import PointSpectra, sample_points
 from hsi_sc_nerf.export.spectral_export import render_cloud
+from hsi_sc_nerf.geometry.camera import unit_vectors
 from hsi_sc_nerf.indices.catalogue import find_indices
 from hsi_sc_nerf.indices.formula import index_values
 from hsi_sc_nerf.light.known_light import read_light
@@ -143,8 +143,7 @@ class Run:
 
         Args:
             points_m: object frame.
-            normals: normals of any length, to either side. Default: the density's gradient, which is off by 10 to 30
-                degrees; a cloud's own normals are off by 1 to 4.
+            normals: normals of any length, to either side. Default: those of the density around each point.
             max_distance_m: largest distance of a point from the model's surface; points further away get NaN.
             views: cameras to average over, at most.
 
@@ -154,13 +153,8 @@ class Run:
         points_m = np.asarray(points_m, float)
         if points_m.ndim != 2 or points_m.shape[1] != 3 or not np.isfinite(points_m).all():
             raise InputError("spectra_at takes points as rows of x, y, z in metres, all finite; correct them.")
-        if normals is None:
-            model = self.trained.model
-            positions = torch.from_numpy(self.trained.to_scene(points_m)).float().to(model.device)
-            normals = -model.field.density_gradient(positions).cpu().numpy()
-        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-        normals = np.divide(normals, lengths, out=np.zeros(points_m.shape), where=lengths > 0.0)
-        return sample_points(self.trained, points_m, normals, max_distance_m, views)
+        directions = None if normals is None else unit_vectors(np.asarray(normals, float))
+        return sample_points(self.trained, points_m, directions, max_distance_m, views)
 
     def render(self, frame: str | None = None, angle_deg: float = 0.0, size: float = 1.0) -> View:
         """Render a view as a cube: a frame of the session, or the object turned before the session's camera.

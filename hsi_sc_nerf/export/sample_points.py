@@ -33,16 +33,19 @@ from hsi_sc_nerf.export.cloud import (
     own_name,
 )
 from hsi_sc_nerf.files import atomic_write
-from hsi_sc_nerf.geometry.camera import pixels_of
+from hsi_sc_nerf.geometry.camera import pixels_of, unit_vectors
 from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.geometry.ply_file import ply_vertices, read_ply
+from hsi_sc_nerf.light.stationary_light import even_directions
 from hsi_sc_nerf.models.spectral_model import SpectralModel
 from hsi_sc_nerf.models.trained_run import TrainedRun
 from hsi_sc_nerf.spectra import to_8_bit
-from hsi_sc_nerf.surface.surface_depth import MIN_OPACITY, render_object, surface_depth
+from hsi_sc_nerf.surface.surface_depth import MIN_OPACITY, render_object, rendered_density, surface_depth
 from hsi_sc_nerf.terminal import progress_bar
 
 BATCH_POINTS = 1 << 12
+_RADII, _DIRECTIONS = (0.02, 0.05), 64
+"""Spheres on which a point's normal is found, about 2 and 5 mm, and how many places of each are looked at."""
 _NO_SPECTRUM_GREY = 64
 """Colour of points without a spectrum, if the file has no colours of its own."""
 
@@ -67,7 +70,7 @@ class PointSpectra:
 def sample_points(
     run: TrainedRun,
     points_m: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"] | None,
     max_distance_m: float,
     max_views: int,
 ) -> PointSpectra:
@@ -75,7 +78,8 @@ def sample_points(
 
     Args:
         points_m: object frame, metres.
-        normals: unit vectors, to either side of the surface; 0 for a point that gets no spectrum.
+        normals: unit vectors, to either side of the surface; 0 for a point that gets no spectrum. None: those of the
+            density around each point (`normals_of_density`).
         max_distance_m: largest distance of a point from the model's surface, along its normal.
         max_views: number of training cameras to average over, at most.
 
@@ -94,9 +98,12 @@ def sample_points(
     @torch.no_grad()
     def density(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 1"]:
         parts = torch.from_numpy(positions).float().to(run.model.device)[:, None].split(BATCH_POINTS)
-        return torch.cat([run.model.field.density_fn(part)[:, 0] for part in parts]).cpu().numpy()
+        return torch.cat([rendered_density(run.model, part)[:, 0] for part in parts]).cpu().numpy()
 
-    outward = outward_normals(normals, points, density, max_distance)
+    if normals is None:
+        outward = normals_of_density(points, density, run.to_scene(run.dataset.object_box_m)[0, 2])
+    else:
+        outward = outward_normals(normals, points, density, max_distance)
     count, bands = len(points), len(run.model.wavelengths_nm)
     result = PointSpectra(outward, np.empty((count, bands), np.float32), *np.zeros((2, count), np.float32))
     with progress_bar("sampling", "points", count) as update:
@@ -124,6 +131,27 @@ def outward_normals(
     """
     inside, outside = density(points - distance * normals), density(points + distance * normals)
     return np.where(outside > inside, -normals, normals)
+
+
+def normals_of_density(
+    points: Float[np.ndarray, "n 3"],
+    density: Callable[[Float[np.ndarray, "m 3"]], Float[np.ndarray, "m 1"]],
+    base: float,
+) -> Float[np.ndarray, "n 3"]:
+    """Outward unit normals: away from what is opaque on spheres around each point; 0 where nothing differs.
+
+    The gradient at the point itself is too rough: a trained density changes from place to place inside of a surface.
+    The larger sphere meets a surface that the point does not lie on. What is lower than ``base``, the object's lowest
+    height, counts for points down there only: to the object's own, its support is no part of it. Scene units.
+    """
+    of_support = points[:, 2:] < base - _RADII[0]
+    normals = np.zeros(points.shape)
+    for radius in _RADII:
+        for direction in even_directions(_DIRECTIONS):
+            at = points + radius * direction
+            counts = of_support | (at[:, 2:] >= base)
+            normals += direction * np.expm1(-_RADII[0] * density(at)) * counts
+    return unit_vectors(normals)
 
 
 def frontal_views(

@@ -5,6 +5,7 @@ import capture_factory as factory
 import numpy as np
 import pytest
 import spectral
+import torch
 from known_ball import CENTRE_M, RADIUS, SCALE, known_run, true_spectra
 from random_cloud import random_cloud
 
@@ -48,13 +49,13 @@ def test_points_have_the_spectrum_of_the_ball_and_points_beside_it_none(run, mon
     found = run.spectra_at(points, points - factory.SPHERE_CENTRE_M)
     np.testing.assert_allclose(found.spectra[:2], np.tile(factory.PLANT, (2, 1)), atol=1e-3)
     assert np.isnan(found.spectra[2]).all()
-    centre = run.trained.to_scene(factory.SPHERE_CENTRE_M)
-    monkeypatch.setattr(
-        run.trained.model.field, "density_gradient", lambda at: at.new_tensor(centre) - at, raising=False
-    )
+    # The gradient of a trained density is off by 10 to 30 degrees; here it is noise.
+    monkeypatch.setattr(run.trained.model.field, "density_gradient", torch.randn_like)
     without_normals = run.spectra_at(points.tolist())
-    np.testing.assert_allclose(without_normals.normals[:2], [[1, 0, 0], [0, 1, 0]], atol=1e-5)
+    np.testing.assert_allclose(without_normals.normals[:2], [[1, 0, 0], [0, 1, 0]], atol=0.04)
+    assert (without_normals.normals[2] == 0).all()
     np.testing.assert_allclose(without_normals.spectra, found.spectra, atol=1e-6)
+    np.testing.assert_array_equal(without_normals.views, found.views)
     for bad in ([1.0, 2.0, 3.0], [[1.0, np.nan, 0.0]], [[1.0, 2.0]]):
         with pytest.raises(InputError, match="x, y, z"):
             run.spectra_at(bad)
