@@ -9,6 +9,7 @@ object falls towards its edge where it is lit from the camera's side, or mirrors
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import takewhile
 from typing import NamedTuple
 
 import cv2
@@ -28,6 +29,8 @@ LEAST_AT_EDGE, LEAST_GLOSSY = 0.5, 0.4
 RING_VARIANCE = 1e-4
 """Added to the variance of the mirrored fraction over the rings: rings differ by 0.02 for other reasons, which would
 pass for gloss on small objects, whose rings mirror hardly anything."""
+MOST_LEFT = 0.8
+"""A matte skin in shade before a bright chamber seems to keep 0.83 to 1 of its score; gloss leaves less."""
 GLOSS_ROUNDS, GLOSS_CHANGE = 4, 0.03
 """Times that gloss is measured and the edges are moved; the change of what gloss leaves below which they stay."""
 GROWTH_PX = 2
@@ -60,6 +63,8 @@ def half_covered_masks(frames: Sequence[GrownMask]) -> list[Bool[np.ndarray, "h 
     for _ in range(GLOSS_ROUNDS):
         found = [glossy_edge(mask, frame.score, frame.brightness) for mask, frame in zip(masks, frames, strict=True)]
         before, gloss_leaves = gloss_leaves, float(np.nanmedian(found)) if np.isfinite(found).any() else 1.0
+        if gloss_leaves > MOST_LEFT:
+            gloss_leaves = 1.0
         if abs(gloss_leaves - before) < GLOSS_CHANGE:
             break
         masks = [at_half_coverage(*frame, gloss_leaves) for frame in frames]
@@ -163,32 +168,34 @@ def _shaded_edge(relative: Float[np.ndarray, "h w"], core: Bool[np.ndarray, "h w
 def glossy_edge(
     mask: Bool[np.ndarray, "h w"], score: Float[np.ndarray, "h w"], brightness: Float[np.ndarray, "h w"]
 ) -> float:
-    """Ratio of score and brightness of an object within half a pixel of its outline, relative to that near its edge.
+    """What gloss leaves of an object's score within half a pixel of its outline, relative to that near its edge.
 
     A clear coat mirrors the chamber, which has no score, the more, the flatter it is looked at (Schlick, An
-    Inexpensive BRDF Model for Physically-based Rendering, 1994). The ratio, which shade does not change, is taken as
-    a linear function of the mirrored fraction: fitted to the rings of pixels inside, and carried on to the outline.
+    Inexpensive BRDF Model for Physically-based Rendering, 1994). So the score is taken as a linear function of the
+    mirrored fraction, fitted to the rings of pixels inside and carried on to the outline, and so is its ratio to the
+    brightness. Both fall by gloss. In shade the score alone falls, and beside what is bright, of which each pixel
+    has a little, the ratio alone. The larger counts.
 
     Returns:
         Between `LEAST_GLOSSY` and 1; not a number for an object of less than three rings.
     """
     core = binary_erosion(mask, _FACES)
-    relative = score / np.maximum(brightness, 1e-3)
     depth_px = cv2.distanceTransform(core.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5) + 0.5
     outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     radius_px = 2.0 * mask.sum() / max(1.0, sum(cv2.arcLength(outline, closed=True) for outline in outlines))
-    fractions, ratios = [], []
-    for ring in (core & (np.abs(depth_px - 1.5 - number) <= 0.5) for number in range(GLOSS_RINGS)):
-        if ring.sum() < RING_PX:
-            break
-        fractions.append(_mirrored_fraction(depth_px[ring], radius_px))
-        ratios.append(float(np.median(relative[ring])))
-    near = float(np.median(_nearby(relative, core)[mask & ~core])) if len(ratios) >= 3 else 0.0
-    if near <= 0.0:
+    rings = [core & (np.abs(depth_px - 1.5 - number) <= 0.5) for number in range(GLOSS_RINGS)]
+    rings = list(takewhile(lambda ring: ring.sum() >= RING_PX, rings))
+    if len(rings) < 3:
         return np.nan
-    slope = np.cov(fractions, ratios, bias=True)[0, 1] / (np.var(fractions) + RING_VARIANCE)
-    change = _mirrored_fraction(np.linspace(0.01, 0.5, 50), radius_px) - np.mean(fractions)
-    return float(np.clip((np.mean(ratios) + slope * change) / near, LEAST_GLOSSY, 1.0))
+    fractions = [_mirrored_fraction(depth_px[ring], radius_px) for ring in rings]
+    at_outline = _mirrored_fraction(np.linspace(0.01, 0.5, 50), radius_px)
+    left = []
+    for image in (score, score / np.maximum(brightness, 1e-3)):
+        near = max(float(np.median(_nearby(image, core)[mask & ~core])), 1e-9)
+        medians = [float(np.median(image[ring])) / near for ring in rings]
+        slope = np.cov(fractions, medians, bias=True)[0, 1] / (np.var(fractions) + RING_VARIANCE)
+        left.append(np.mean(medians) + slope * (at_outline - np.mean(fractions)))
+    return float(np.clip(max(left), LEAST_GLOSSY, 1.0))
 
 
 def _mirrored_fraction(depth_px: Float[np.ndarray, "n"], radius_px: float) -> float:
