@@ -29,6 +29,9 @@ LIMB = 0.966
 """Length in the image of the unit normals at 75 degrees from the camera's axis. Normals beyond have the shading of
 those. Pixels at the limb also cover what is behind it: shading of their own would take over its colour, and the
 surface come out too far, further with every step (docs/notes/earlier_measurements.md)."""
+MIRRORED_CELLS, OBJECT_OPACITY = (5, 8, 11, 14, 18), 0.4
+"""Where a mirrored ray is looked up, in cells from its start (11 to 40 mm), and the smoothed opacity from which it has
+met the object again. At less than 5 cells, the surface that mirrors it is still near."""
 LARGEST_LOG_GAIN = 4.0
 """No lamp is 50 times brighter than the chamber's mean; what is more would be a step gone wrong."""
 
@@ -135,6 +138,27 @@ class CameraShading(nn.Module):
             self._normals, at[None, None, None], mode="bilinear", padding_mode="border", align_corners=False
         )[0, :, 0, 0].T
         return functional.normalize(gradient, dim=-1, eps=1e-12)
+
+    @torch.no_grad()
+    def open_normals(self, positions: Float[Tensor, "n 3"], origins: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Normals where the ray that is mirrored there meets no object again; 0 elsewhere, as at the rim of a hollow.
+
+        Args:
+            positions: positions of the points, scene units.
+            origins: origins of the rays that see the points, scene units.
+        """
+        normals, along = self.normals(positions), functional.normalize(positions - origins, dim=-1)
+        mirrored = along - 2.0 * (along * normals).sum(dim=-1, keepdim=True) * normals
+        cell = self._sides[0] / self.smoothed.shape[0]
+        is_open = torch.ones_like(positions[:, 2], dtype=torch.bool)
+        for cells in MIRRORED_CELLS:
+            there = positions + cells * cell * mirrored
+            at = (2.0 * (there - self._lower) / self._sides - 1.0).flip(-1).nan_to_num()
+            opacity = functional.grid_sample(
+                self.smoothed[None, None], at[None, None, None], mode="bilinear", align_corners=False
+            )
+            is_open &= (opacity[0, 0, 0, 0] <= OBJECT_OPACITY) | (there[:, 2] <= self.base)
+        return normals * is_open[:, None]
 
     def across_image(
         self, origins: Float[Tensor, "n 3"], *vectors: Float[Tensor, "n 3"]

@@ -26,6 +26,7 @@ from nerfstudio.fields.nerfacto_field import NerfactoField
 from torch import Tensor, nn
 
 from hsi_sc_nerf.fields.camera_shading import CameraShading
+from hsi_sc_nerf.fields.coat import Coat
 from hsi_sc_nerf.fields.hash_grid import FusedHashEncoding, fuse_hash_encodings
 from hsi_sc_nerf.fields.surface_opacity import opaque_density
 
@@ -53,6 +54,7 @@ class SpectralField(NerfactoField):
             end in a sigmoid.
         view_dependent: whether the head sees the viewing direction.
         shading: shading of the coefficients, by the normal in the camera's frame; None for none.
+        coat: what shaded coefficients mirror; given if ``shading`` is.
         hidden_dim_color: width of the radiance head.
         num_layers_color: layers of the radiance head.
         skip_unseen: give samples of nil weight no spectrum, unless on a GPU.
@@ -78,6 +80,7 @@ class SpectralField(NerfactoField):
         coefficient_start: Float[Tensor, "rank"] | None = None,
         view_dependent: bool = True,
         shading: CameraShading | None = None,
+        coat: Coat | None = None,
         hidden_dim_color: int = 64,
         num_layers_color: int = 3,
         skip_unseen: bool = False,
@@ -85,7 +88,7 @@ class SpectralField(NerfactoField):
         **nerfacto,
     ) -> None:
         super().__init__(aabb, hidden_dim_color=hidden_dim_color, num_layers_color=num_layers_color, **nerfacto)
-        self.view_dependent, self.shading = view_dependent, shading
+        self.view_dependent, self.shading, self.coat = view_dependent, shading, coat
         self.skip_unseen, self.rises = skip_unseen, rises
         self.register_buffer("rise_length", torch.zeros(()))  # kept with the weights, which mean nothing without it
         direction_channels = self.direction_encoding.get_out_dim() if view_dependent else 0
@@ -140,7 +143,10 @@ class SpectralField(NerfactoField):
     def get_outputs(
         self, ray_samples: RaySamples, density_embedding: Float[Tensor, "rays samples geo"] | None = None
     ) -> dict[FieldHeadNames, Tensor]:
-        """Spectra or coefficients (and predicted normals) at samples along rays."""
+        """Spectra or coefficients (and predicted normals) at samples along rays.
+
+        With a coat, one more channel is the fraction of light that is mirrored from the chamber behind the object.
+        """
         assert density_embedding is not None
         outputs: dict[FieldHeadNames, Tensor] = {}
         if self.use_pred_normals:
@@ -169,10 +175,12 @@ class SpectralField(NerfactoField):
         spectra = self.mlp_head(torch.cat(inputs, dim=-1).to(ray_samples.frustums.directions))
         if self.shading is not None:
             assert self._sample_locations is not None
+            assert self.coat is not None
             points = (self._sample_locations.detach(), ray_samples.frustums.origins[..., :1, :].detach())
             positions, origins = (of_samples(point).reshape(-1, 3) for point in points)
             shaded = self.shading(spectra.flatten(0, -2), positions, origins)
-            spectra = shaded.view_as(spectra)
+            coated = self.coat(shaded, positions, origins, self.shading.open_normals(positions, origins))
+            spectra = torch.cat(coated, dim=-1).view(*spectra.shape[:-1], spectra.shape[-1] + 1)
         if seen is not None:
             nothing = spectra.new_zeros(math.prod(samples), spectra.shape[-1])
             spectra = nothing.index_copy(0, seen, spectra).view(*samples, -1)

@@ -13,6 +13,7 @@ from nerfstudio.models.nerfacto import NerfactoModelConfig
 from torch import Tensor
 
 from hsi_sc_nerf.fields.camera_shading import CameraShading
+from hsi_sc_nerf.fields.coat import Coat
 from hsi_sc_nerf.fields.hash_grid import GridSize
 from hsi_sc_nerf.fields.occupancy_grid import OccupancyGrid
 from hsi_sc_nerf.fields.spectral_field import SpectralField, SpectralProposalField
@@ -63,6 +64,7 @@ def build_field(
         camera, axis = (torch.from_numpy(np.asarray(turntable[key])) for key in ("camera_to_world", "axis_origin"))
         rank = len(subspace.mean_coefficients)
         options["shading"] = CameraShading(shape, occupancy.lower, occupancy.cell, rank, camera, axis, base)
+        options["coat"] = Coat(occupancy.lower, torch.tensor(shape) * occupancy.cell, base, rank)
     return SpectralField(
         aabb,
         num_bands=num_bands,

@@ -251,9 +251,13 @@ class SpectralModel(NerfactoModel):
         if not self.training:
             self.camera_optimizer.apply_to_raybundle(ray_bundle)
         outputs = self._of_all_rays(super().get_outputs(ray_bundle), ray_bundle)
-        spectral = self.decoder(outputs["rgb"])
+        coefficients, from_behind = outputs["rgb"], 1.0 - outputs["accumulation"]
+        if self.field.coat is not None:
+            coefficients, mirrored = coefficients[..., :-1], coefficients[..., -1:]
+            from_behind = from_behind + mirrored
+        spectral = self.decoder(coefficients)
         if background is not None:
-            spectral = spectral + background * (1.0 - outputs["accumulation"])
+            spectral = spectral + background * from_behind
         # Coefficients of a basis may decode to slightly negative reflectance.
         outputs["spectral"] = spectral if self.training else spectral.clamp_min(0.0)
         # An index of numbers would be a transfer to the device, for which that has to wait.
