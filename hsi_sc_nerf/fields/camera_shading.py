@@ -30,8 +30,8 @@ LIMB = 0.966
 those. Pixels at the limb also cover what is behind it: shading of their own would take over its colour, and the
 surface come out too far, further with every step (docs/notes/earlier_measurements.md)."""
 MIRRORED_CELLS, OBJECT_OPACITY = (5, 8, 11, 14, 18), 0.4
-"""Where a mirrored ray is looked up, in cells from its start (11 to 40 mm), and the smoothed opacity from which it has
-met the object again. At less than 5 cells, the surface that mirrors it is still near."""
+"""Where a mirrored ray is looked up, in cells from its start (11 to 40 mm), and the smoothed opacity of an object.
+Before 5 cells, the surface that mirrors it is still near."""
 LARGEST_LOG_GAIN = 4.0
 """No lamp is 50 times brighter than the chamber's mean; what is more would be a step gone wrong."""
 

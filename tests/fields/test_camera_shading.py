@@ -45,6 +45,27 @@ def test_normals_of_a_ball_point_outwards():
     assert torch.rad2deg(torch.acos(cos.clamp(max=1.0))).max() < 4.0
 
 
+def test_a_mirrored_ray_that_meets_the_object_again_shows_nothing_behind_it():
+    """A ball alone mirrors what is behind it all around. With a wall behind, the side towards the wall does not."""
+    made, camera = shading(), pose(20.0)[:3, 3]
+    points = on_ball(2000)
+    to_camera = functional.normalize(camera - points, dim=-1)
+    cosines = (to_camera * points / RADIUS).sum(dim=-1)
+    limb = points[(cosines > 0.0) & (cosines < 0.15)]
+    origins = camera.expand(len(limb), 3)
+    torch.testing.assert_close(made.open_normals(limb, origins), made.normals(limb))
+    away = functional.normalize(-camera[:2], dim=0)
+    indices = torch.stack(torch.meshgrid(*(torch.arange(n) for n in SHAPE), indexing="ij"), dim=-1)
+    behind = (LOWER + (indices + 0.5) * CELL)[..., :2] @ away
+    left = (LOWER + (indices + 0.5) * CELL)[..., :2] @ torch.stack([-away[1], away[0]])
+    made.refresh(torch.where((behind > 0.5) & (left > 0.2), 1.0, ball_opacity()))
+    to_left = limb[:, :2] @ torch.stack([-away[1], away[0]])
+    is_open = (made.open_normals(limb, origins) != 0.0).any(dim=-1)
+    low = limb[:, 2].abs() < 0.2
+    assert is_open[low & (to_left > 0.6)].float().mean() < 0.25  # some rays pass the wall by
+    assert is_open[to_left < 0.0].all()
+
+
 def test_object_and_support_have_functions_of_their_own():
     made, points = shading(base=0.0), on_ball(200)
     origins, coefficients = pose(50.0)[:3, 3].expand(200, 3), torch.ones(200, CHANNELS)
