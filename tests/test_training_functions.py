@@ -84,9 +84,10 @@ def shading():
 
 
 def of_shading():
-    method = Method(shading(), "forward")
+    made = shading()
+    method = Method(made, "forward")
     points, origins = random(6, 3) - 0.5, torch.from_numpy(POSE[:3, 3]) + 0.1 * random(6, 3, seed=1)
-    return lambda coefficients, *leaves: method.of(leaves, coefficients, points, origins), [
+    return lambda coefficients, *leaves: method.of(leaves, coefficients, points, origins, made.normals(points)), [
         random(6, 3, seed=2),
         *method.leaves,
     ]
@@ -170,11 +171,13 @@ def test_low_precision_is_that_of_float64(case, dtype):
     rounded = [leaf.to(dtype) for leaf in leaves]
     expected = function(*(leaf.double() for leaf in rounded))
     if case == "shading":
-        method = Method(shading().float(), "forward")
+        single = shading().float()
+        method = Method(single, "forward")
         points, origins = random(6, 3) - 0.5, torch.from_numpy(POSE[:3, 3]) + 0.1 * random(6, 3, seed=1)
         rounded = [leaf.float().requires_grad_() for leaf in rounded]
         with torch.autocast("cpu", dtype=dtype):
-            found = method.of(rounded[1:], rounded[0], points.float(), origins.float())
+            normals = single.normals(points.float())
+            found = method.of(rounded[1:], rounded[0], points.float(), origins.float(), normals)
     else:
         rounded = [leaf.requires_grad_() for leaf in rounded]
         found = function(*rounded)
@@ -304,7 +307,7 @@ def test_shading_far_away_on_faces_and_on_the_axis_is_finite():
     coefficients = torch.tensor([0.0, 1e-40, 1.0, -1.0, 1e30])[:, None].expand(5, 3).clone().requires_grad_()
     origins = torch.tensor([[2.0, 0.3, 0.9], [0.0, 0.0, 3.0], [1e-30, 0.0, 0.0], [1e18, 0.0, 0.0], [0.5, 0.5, 0.5]])
     assert all(part.isfinite().all() for part in made.across_image(origins, points[:1].expand(5, 3)))
-    shaded = made(coefficients, points, origins)
+    shaded = made(coefficients, points, origins, made.normals(points))
     assert shaded.isfinite().all()
     for gradient in torch.autograd.grad(shaded[:4].sum(), [coefficients, *made.parameters()]):
         assert gradient.isfinite().all()
@@ -323,7 +326,7 @@ def test_normals_are_unit_vectors_or_nothing():
 def test_places_that_are_no_numbers_are_looked_up_somewhere(count):
     """The gradient of PyTorch's look-up would be written outside of its table there, and ends the process."""
     nowhere, made = torch.full((count, 3), torch.nan), shading().float()
-    shaded = made(torch.ones(count, 3), nowhere, nowhere)
+    shaded = made(torch.ones(count, 3), nowhere, nowhere, made.normals(nowhere))
     assert shaded.isfinite().all()
     for gradient in torch.autograd.grad(shaded.sum(), [*made.maps, *made.network.parameters()]):
         assert gradient.isfinite().all()

@@ -57,7 +57,7 @@ class CameraShading(nn.Module):
     Example:
         >>> shading = CameraShading(grid.opacity.shape, grid.lower, grid.cell, 8, camera_to_world, axis_origin, -0.1)
         >>> shading.refresh(grid.opacity)
-        >>> shaded = shading(coefficients, positions, origins)
+        >>> shaded = shading(coefficients, positions, origins, shading.normals(positions))
     """
 
     smoothed: Tensor
@@ -109,6 +109,7 @@ class CameraShading(nn.Module):
         coefficients: Float[Tensor, "n channels"],
         positions: Float[Tensor, "n 3"],
         origins: Float[Tensor, "n 3"],
+        normals: Float[Tensor, "n 3"],
     ) -> Float[Tensor, "n channels"]:
         """Shaded coefficients of points.
 
@@ -116,10 +117,11 @@ class CameraShading(nn.Module):
             coefficients: coefficients of the points.
             positions: positions of the points, scene units; they get no gradient.
             origins: origins of the rays that see the points, scene units: the camera from there.
+            normals: :meth:`normals` of the points.
         """
         with torch.no_grad():
-            normals, aside = self.across_image(origins, self.normals(positions), positions - self._axis)
-        within = normals * (LIMB / normals.norm(dim=-1, keepdim=True).clamp_min(LIMB))
+            facing, aside = self.across_image(origins, normals, positions - self._axis)
+        within = facing * (LIMB / facing.norm(dim=-1, keepdim=True).clamp_min(LIMB))
         # At NaN, the gradient of grid_sample is written outside of its table.
         at = (within + self.parallax * aside).nan_to_num()[None, None]
         looked_up = [
@@ -130,35 +132,40 @@ class CameraShading(nn.Module):
         log_gain, gloss = self.network(torch.cat(looked_up, dim=-1)).split([1, coefficients.shape[-1]], dim=-1)
         return coefficients * torch.exp(log_gain.clamp(-LARGEST_LOG_GAIN, LARGEST_LOG_GAIN)) + gloss
 
+    @torch.no_grad()
     def normals(self, positions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Unit normals out of the surface, object's frame, from the smoothed opacities; 0 where these are even."""
-        # grid_sample counts from -1 to 1 from border to border, and the last axis first.
-        at = (2.0 * (positions - self._lower) / self._sides - 1.0).flip(-1)
-        gradient = functional.grid_sample(
-            self._normals, at[None, None, None], mode="bilinear", padding_mode="border", align_corners=False
-        )[0, :, 0, 0].T
-        return functional.normalize(gradient, dim=-1, eps=1e-12)
+        return functional.normalize(self._look_up(self._normals, positions, "border"), dim=-1, eps=1e-12)
 
     @torch.no_grad()
-    def open_normals(self, positions: Float[Tensor, "n 3"], origins: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    def open_normals(
+        self, positions: Float[Tensor, "n 3"], origins: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]
+    ) -> Float[Tensor, "n 3"]:
         """Normals where the ray that is mirrored there meets no object again; 0 elsewhere, as at the rim of a hollow.
 
         Args:
             positions: positions of the points, scene units.
             origins: origins of the rays that see the points, scene units.
+            normals: :meth:`normals` of the points.
         """
-        normals, along = self.normals(positions), functional.normalize(positions - origins, dim=-1)
+        along = functional.normalize(positions - origins, dim=-1)
         mirrored = along - 2.0 * (along * normals).sum(dim=-1, keepdim=True) * normals
         cell = self._sides[0] / self.smoothed.shape[0]
-        is_open = torch.ones_like(positions[:, 2], dtype=torch.bool)
+        is_open = torch.ones_like(positions[:, 2:], dtype=torch.bool)
         for cells in MIRRORED_CELLS:
             there = positions + cells * cell * mirrored
-            at = (2.0 * (there - self._lower) / self._sides - 1.0).flip(-1).nan_to_num()
-            opacity = functional.grid_sample(
-                self.smoothed[None, None], at[None, None, None], mode="bilinear", align_corners=False
-            )
-            is_open &= (opacity[0, 0, 0, 0] <= OBJECT_OPACITY) | (there[:, 2] <= self.base)
-        return normals * is_open[:, None]
+            opacity = self._look_up(self.smoothed[None, None], there.nan_to_num(), "zeros")
+            is_open &= (opacity <= OBJECT_OPACITY) | (there[:, 2:] <= self.base)
+        return normals * is_open
+
+    def _look_up(
+        self, values: Float[Tensor, "1 channels x y z"], positions: Float[Tensor, "n 3"], outside: str
+    ) -> Float[Tensor, "n channels"]:
+        """Values of a grid at positions, between the centres of its cells; outside as grid_sample's padding mode."""
+        # grid_sample counts from -1 to 1 from border to border, and the last axis first.
+        at = (2.0 * (positions - self._lower) / self._sides - 1.0).flip(-1)[None, None, None]
+        found = functional.grid_sample(values, at, mode="bilinear", padding_mode=outside, align_corners=False)
+        return found[0, :, 0, 0].T
 
     def across_image(
         self, origins: Float[Tensor, "n 3"], *vectors: Float[Tensor, "n 3"]

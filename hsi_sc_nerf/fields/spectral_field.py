@@ -178,8 +178,9 @@ class SpectralField(NerfactoField):
             assert self.coat is not None
             points = (self._sample_locations.detach(), ray_samples.frustums.origins[..., :1, :].detach())
             positions, origins = (of_samples(point).reshape(-1, 3) for point in points)
-            shaded = self.shading(spectra.flatten(0, -2), positions, origins)
-            coated = self.coat(shaded, positions, origins, self.shading.open_normals(positions, origins))
+            normals = self.shading.normals(positions)
+            shaded = self.shading(spectra.flatten(0, -2), positions, origins, normals)
+            coated = self.coat(shaded, positions, origins, self.shading.open_normals(positions, origins, normals))
             spectra = torch.cat(coated, dim=-1).view(*spectra.shape[:-1], spectra.shape[-1] + 1)
         if seen is not None:
             nothing = spectra.new_zeros(math.prod(samples), spectra.shape[-1])

@@ -35,6 +35,10 @@ def shading(device="cpu", base=-RADIUS) -> CameraShading:
     return made
 
 
+def shade(made, coefficients, points, origins) -> torch.Tensor:
+    return made(coefficients, points, origins, made.normals(points))
+
+
 def on_ball(count: int, seed: int = 0) -> torch.Tensor:
     return RADIUS * functional.normalize(torch.randn(count, 3, generator=torch.Generator().manual_seed(seed)), dim=-1)
 
@@ -53,14 +57,14 @@ def test_a_mirrored_ray_that_meets_the_object_again_shows_nothing_behind_it():
     cosines = (to_camera * points / RADIUS).sum(dim=-1)
     limb = points[(cosines > 0.0) & (cosines < 0.15)]
     origins = camera.expand(len(limb), 3)
-    torch.testing.assert_close(made.open_normals(limb, origins), made.normals(limb))
+    torch.testing.assert_close(made.open_normals(limb, origins, made.normals(limb)), made.normals(limb))
     away = functional.normalize(-camera[:2], dim=0)
     indices = torch.stack(torch.meshgrid(*(torch.arange(n) for n in SHAPE), indexing="ij"), dim=-1)
     behind = (LOWER + (indices + 0.5) * CELL)[..., :2] @ away
     left = (LOWER + (indices + 0.5) * CELL)[..., :2] @ torch.stack([-away[1], away[0]])
     made.refresh(torch.where((behind > 0.5) & (left > 0.2), 1.0, ball_opacity()))
     to_left = limb[:, :2] @ torch.stack([-away[1], away[0]])
-    is_open = (made.open_normals(limb, origins) != 0.0).any(dim=-1)
+    is_open = (made.open_normals(limb, origins, made.normals(limb)) != 0.0).any(dim=-1)
     low = limb[:, 2].abs() < 0.2
     assert is_open[low & (to_left > 0.6)].float().mean() < 0.25  # some rays pass the wall by
     assert is_open[to_left < 0.0].all()
@@ -71,9 +75,9 @@ def test_object_and_support_have_functions_of_their_own():
     origins, coefficients = pose(50.0)[:3, 3].expand(200, 3), torch.ones(200, CHANNELS)
     with torch.no_grad():
         made.network.layers[-1].weight.fill_(0.1)
-        before = made(coefficients, points, origins)
+        before = shade(made, coefficients, points, origins)
         made.network.layers[0].weight[:, -1] += 1.0
-    changed = (made(coefficients, points, origins) - before).abs().amax(dim=-1) > 1e-3
+    changed = (shade(made, coefficients, points, origins) - before).abs().amax(dim=-1) > 1e-3
     assert torch.equal(changed, points[:, 2] < 0.0)
 
 
@@ -89,7 +93,7 @@ def test_the_limb_has_the_shading_of_normals_before_it():
         angle = math.radians(angle_deg)
         normal = math.sin(angle) * aside + math.cos(angle) * torch.tensor([0.0, 0.0, 1.0])
         made._normals.copy_((camera[:3, :3] @ normal)[None, :, None, None, None])
-        return made(torch.ones(1, CHANNELS), torch.zeros(1, 3), camera[None, :3, 3])
+        return shade(made, torch.ones(1, CHANNELS), torch.zeros(1, 3), camera[None, :3, 3])
 
     torch.testing.assert_close(at(80.0), at(math.degrees(math.asin(LIMB))))
     assert (at(70.0) - at(60.0)).abs().max() > 1e-3
@@ -102,7 +106,7 @@ def test_a_grid_without_matter_has_no_normals_and_finite_shading():
     assert (made.normals(on_ball(5)) == 0.0).all()
     # The second ray begins on the axis, where a camera has no azimuth.
     origins = torch.tensor([[3.0, 0.0, 1.0], [0.0, 0.0, 5.0]])
-    assert made(torch.ones(2, CHANNELS), torch.full((2, 3), 9.0), origins).isfinite().all()
+    assert shade(made, torch.ones(2, CHANNELS), torch.full((2, 3), 9.0), origins).isfinite().all()
 
 
 def test_smoothing_keeps_the_sum_and_has_the_stated_deviation():
@@ -126,14 +130,14 @@ def test_the_camera_turns_with_the_azimuth(azimuth_deg):
 def test_training_begins_without_shading():
     coefficients = torch.randn(40, CHANNELS)
     origins = pose(50.0)[:3, 3].expand(40, 3)
-    torch.testing.assert_close(shading()(coefficients, on_ball(40), origins), coefficients)
+    torch.testing.assert_close(shade(shading(), coefficients, on_ball(40), origins), coefficients)
 
 
 def test_a_gain_beyond_reason_stays_finite():
     made = shading()
     made.network.layers[-1].bias.data.fill_(1e4)
     coefficients = torch.ones(4, CHANNELS, requires_grad=True)
-    shaded = made(coefficients, on_ball(4), torch.full((4, 3), 3.0))
+    shaded = shade(made, coefficients, on_ball(4), torch.full((4, 3), 3.0))
     shaded.sum().backward()
     assert shaded.isfinite().all()
     assert coefficients.grad.isfinite().all()
@@ -162,13 +166,13 @@ def test_a_new_highlight_is_foretold_from_others():
         camera = cameras[step % 15]
         facing = (points @ camera[:3, 2] > 0.0).nonzero()[:, 0][step % 2 :: 2]
         origins = camera[:3, 3].expand(len(facing), 3)
-        error = made(spectra[facing], points[facing], origins) - seen(camera)[facing]
+        error = shade(made, spectra[facing], points[facing], origins) - seen(camera)[facing]
         optimizer.zero_grad()
         error.square().mean().backward()
         optimizer.step()
     camera = cameras[22]
     facing = points @ camera[:3, 2] > 0.1
-    shaded = made(spectra[facing], points[facing], camera[:3, 3].expand(int(facing.sum()), 3))
+    shaded = shade(made, spectra[facing], points[facing], camera[:3, 3].expand(int(facing.sum()), 3))
     error = (shaded - seen(camera)[facing]).square().mean().sqrt()
     without = (spectra[facing] - seen(camera)[facing]).square().mean().sqrt()
     assert error < 0.2 * without
@@ -181,5 +185,5 @@ def test_shading_on_a_gpu_is_that_of_the_processor(device):
     here, there = shading(), shading(device)
     for made in (here, there):
         made.network.layers[-1].weight.data.fill_(0.1)
-    found = there(coefficients.to(device), points.to(device), origins.to(device))
-    torch.testing.assert_close(found.cpu(), here(coefficients, points, origins), atol=1e-4, rtol=1e-4)
+    found = shade(there, coefficients.to(device), points.to(device), origins.to(device))
+    torch.testing.assert_close(found.cpu(), shade(here, coefficients, points, origins), atol=1e-4, rtol=1e-4)
