@@ -21,8 +21,6 @@ SAME_BAND_NM = 1.0
 """Bands of two days that are further apart are others."""
 SEEN_WITHIN = 2.0
 """Smoothing radii from a vertex within which a day's cloud must have points: surfaces move."""
-_ONE_SIDED = 0.6
-"""Distance of the nearest points' mean over that of the furthest of them: 0.42 at a straight edge."""
 
 
 @dataclass(frozen=True)
@@ -98,15 +96,11 @@ def days_on_one_mesh(
                 raise InputError(f"{name} beside {names[0]}: {error}") from error
             moved = replace(cloud, points=attitude.transform(cloud.points))
         surface = with_spectra(mesh, moved, SEEN_WITHIN * config.smoothing_radius_m, max_incidence_deg)
-        distance_m, near = cKDTree(moved.points).query(mesh.vertices, k=min(NEIGHBOURS, len(moved.points)))
+        near = cKDTree(moved.points).query(mesh.vertices, k=min(NEIGHBOURS, len(moved.points)))[1]
         offset = moved.points[near].mean(axis=1) - mesh.vertices
         raised_m = np.einsum("vj,vj->v", offset, normals)
-        # Beyond the edge of a cloud, the nearest points all lie on one side and say nothing of the vertex.
-        aside_m = np.linalg.norm(offset - raised_m[:, None] * normals, axis=1)
-        beyond_edge = (aside_m > _ONE_SIDED * distance_m[:, -1]) & (aside_m > config.smoothing_radius_m / 2.0)
-        seen = surface.seen & ~beyond_edge
-        seen_raised_m = np.where(seen, raised_m, np.nan)
-        days.append(Day(name, replace(surface, seen=seen), seen_raised_m, _conditions(moved, near), attitude))
+        seen_raised_m = np.where(surface.seen, raised_m, np.nan)
+        days.append(Day(name, surface, seen_raised_m, _conditions(moved, near), attitude))
     return days
 
 

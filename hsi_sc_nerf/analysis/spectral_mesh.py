@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from hsi_sc_nerf import paper
@@ -24,6 +24,11 @@ from hsi_sc_nerf.geometry.mesh import Mesh
 from hsi_sc_nerf.spectra import nearest_bands, to_8_bit
 
 NEIGHBOURS = 8
+_EDGE_NEIGHBOURS = 24
+"""Nearest points by which the edge of a cloud is found. Fewer lie on one side by chance."""
+_ON_EDGE, _AT_POINT = 4.0 / (3.0 * np.pi), 0.1
+"""Distance of a half disc's centroid from the middle of its straight side, and that of a point at the vertex itself,
+as fractions of the distance of the furthest of these points."""
 _CHUNK_VERTICES = 1 << 13
 
 
@@ -51,7 +56,7 @@ class SpectralMesh:
         spectra: reflectance, of the material where the cloud has it; unseen vertices have that of the nearest seen
             points.
         wavelengths_nm: band centres.
-        seen: vertices with points of the cloud nearby; False on the closed base.
+        seen: vertices with points of the cloud nearby and around them; False on the closed base.
         lit: reflectance as measured and the light that it was measured in, where the cloud tells the two apart.
         scatter: standard deviation of a vertex's measured reflectance, mean over bands, by how much frames disagree;
             NaN where fewer than two frames see it. None if the cloud does not tell.
@@ -84,7 +89,7 @@ def with_spectra(
     Args:
         mesh: in the frame of the cloud.
         cloud: the points that the mesh was made from.
-        seen_within_m: vertices without a point at this distance are unseen.
+        seen_within_m: vertices without a point at this distance, or beyond the edge of the points, are unseen.
         max_incidence_deg: points with a larger `INCIDENCE` are ignored, because their pixels are mixed.
 
     Raises:
@@ -106,10 +111,13 @@ def with_spectra(
             f"no point of the cloud is seen at {max_incidence_deg:g} degrees or less from the front; raise "
             "--max-incidence-deg."
         )
-    count = np.arange(1, min(NEIGHBOURS, len(used)) + 1)
-    distance_m, neighbours = cKDTree(cloud.points[used]).query(mesh.vertices, count, workers=-1)
+    points = cloud.points[used]
+    count = np.arange(1, min(_EDGE_NEIGHBOURS, len(used)) + 1)
+    distance_m, neighbours = cKDTree(points).query(mesh.vertices, count, workers=-1)
+    seen = (distance_m[:, 0] <= seen_within_m) & ~_beyond_edge(mesh, points, neighbours)
+    distance_m, neighbours = distance_m[:, :NEIGHBOURS], neighbours[:, :NEIGHBOURS]
     weights = np.exp(-2.0 * (distance_m / np.maximum(distance_m[:, -1:], 1e-12)) ** 2).astype(np.float32)
-    weights, seen = weights / weights.sum(axis=1, keepdims=True), distance_m[:, 0] <= seen_within_m
+    weights /= weights.sum(axis=1, keepdims=True)
 
     def mean(values: Float[np.ndarray, "n columns"]) -> Float[np.ndarray, "v columns"]:
         found = np.empty((len(neighbours), values.shape[1]), np.float32)
@@ -128,6 +136,21 @@ def with_spectra(
             of_points = cloud.extra["spectral_std"] / np.sqrt(cloud.extra["views"])
         scatter = mean(of_points[:, None])[:, 0]
     return SpectralMesh(mesh, spectra, cloud.wavelengths_nm, seen, lit, scatter, cloud.metric)
+
+
+def _beyond_edge(
+    mesh: Mesh, points: Float[np.ndarray, "n 3"], neighbours: Int[np.ndarray, "v k"]
+) -> Bool[np.ndarray, "v"]:
+    """Vertices whose nearest points lie more to one side, along the surface, than on a straight edge of points."""
+    found, normals = np.zeros(len(neighbours), bool), mesh.vertex_normals()
+    for start in range(0, len(found), _CHUNK_VERTICES):
+        chunk = slice(start, start + _CHUNK_VERTICES)
+        offset, normal = points[neighbours[chunk]] - mesh.vertices[chunk, None], normals[chunk, None]
+        offset = offset - (offset * normal).sum(axis=-1, keepdims=True) * normal
+        distance_m, aside_m = np.linalg.norm(offset, axis=-1), np.linalg.norm(offset.mean(axis=1), axis=-1)
+        reach_m = distance_m.max(axis=1)
+        found[chunk] = (aside_m > _ON_EDGE * reach_m) & (distance_m.min(axis=1) > _AT_POINT * reach_m)
+    return found
 
 
 def write_spectral_mesh(path: Path, surface: SpectralMesh, extra: dict[str, Float[np.ndarray, "v"]]) -> None:
