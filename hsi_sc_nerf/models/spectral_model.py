@@ -178,7 +178,7 @@ class SpectralModel(NerfactoModel):
         self.field = build_field(
             config,
             len(dataset.wavelengths_nm),
-            grid_for_dataset(dataset) if config.match_resolution else None,
+            grid_for_dataset(dataset, "scattered_brightness" in self.effects) if config.match_resolution else None,
             self.scene_box.aabb,
             self.num_train_data,
             view_dependent="view_dependence" in self.effects,
