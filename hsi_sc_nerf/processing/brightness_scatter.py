@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from hsi_sc_nerf.processing.view_changes import MOST_CHANGE, Change, PointViews, change_of, mean_by_index
 
-LARGEST_STEP_DEG = 15.0
+LARGEST_STEP_DEG = 16.0
 """Frames further apart see a point in too different a light to tell what is by chance."""
 FEWEST_OF_SECTOR = 30
 """Values of a sector from which its scatter is taken."""
