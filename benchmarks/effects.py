@@ -82,8 +82,6 @@ CASES = (
         ),
         ("view_dependence", "uneven_light", "saturated_highlights"),
     ),
-    Case("speckle of 5 %", ("speckle",), ("scattered_brightness",)),
-    Case("speckle of 0.5 %", ("{speckle: {spread: 0.005}}",)),
     Case("poses wrong by 0.05 degrees", pose_error_deg=0.05),
     Case("nothing but noise, apple", scene="apple"),
     Case("tomato, its own gloss", weak=("view_dependence", "uneven_light"), scene="tomato"),
@@ -94,7 +92,6 @@ TRAINED = {
     "wooden boards": ("still_chamber",),
     "poses wrong by 0.6 degrees": ("pose_refinement",),
     "gloss in an even chamber": ("view_dependence",),
-    "speckle of 5 %": ("scattered_brightness",),
 }
 """Cases that models are trained on, and effects that are left out in turn, or added where they are not chosen."""
 DECISIONS = ("effect", "session", "simulated", "evidence", "noise", "threshold", "unit", "decided", "right")

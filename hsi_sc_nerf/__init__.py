@@ -6,7 +6,7 @@ What notebooks need has its name here, and is imported when it is first used (do
 from importlib import import_module
 from typing import Any
 
-__version__ = "0.4.0"
+__version__ = "0.3.0"
 
 _API = {
     "load_scene": "simulate.scene",

@@ -20,10 +20,9 @@ from torch.nn import functional as F
 
 from hsi_sc_nerf.packed.dataset import PackedDataset
 
-CELLS_PER_PIXEL, CELLS_OF_SCATTERED = 2.0, 1.0
-"""Cells along what one pixel covers at the object: four resolve more, but gain nothing at equal time
-(docs/notes/dead_ends.md). And where brightness scatters from frame to frame, which two cells a pixel learn as texture
-(docs/validation/effects.md)."""
+CELLS_PER_PIXEL = 2.0
+"""Cells along what one pixel covers at the object. Four resolve more, but gain nothing at equal time
+(docs/notes/dead_ends.md)."""
 COARSEST_GRID = 16
 """Cells along the scene box in the first level, nerfacto's."""
 LEVEL_GROWTH = 1.38
@@ -185,21 +184,18 @@ class GridSize:
     log2_table: int
 
 
-def grid_for_dataset(dataset: PackedDataset, scattered: bool = False) -> GridSize:
-    """The grid that resolves in the scene box what the camera does; a coarser one for scattered brightness."""
-    cells_per_pixel = CELLS_OF_SCATTERED if scattered else CELLS_PER_PIXEL
+def grid_for_dataset(dataset: PackedDataset) -> GridSize:
+    """The grid that resolves in the scene box what the camera does."""
     box = dataset.scene_box_m
     distance_m = np.linalg.norm(dataset.camera_to_worlds[:, :3, 3] - box.mean(axis=0), axis=1).mean()
     side_m, footprint_m = float((box[1] - box[0]).max()), float(distance_m) / dataset.intrinsics.fl_x
-    return grid_for_resolution(side_m, footprint_m, len(dataset.frames), cells_per_pixel)
+    return grid_for_resolution(side_m, footprint_m, len(dataset.frames))
 
 
-def grid_for_resolution(
-    box_side_m: float, pixel_footprint_m: float, frames: int, cells_per_pixel: float = CELLS_PER_PIXEL
-) -> GridSize:
+def grid_for_resolution(box_side_m: float, pixel_footprint_m: float, frames: int) -> GridSize:
     """Grid of a scene box for a camera and a number of frames.
 
-    The finest level has so many cells a pixel; the number of levels follows from `LEVEL_GROWTH`. A table
+    The finest level has `CELLS_PER_PIXEL` cells a pixel; the number of levels follows from `LEVEL_GROWTH`. A table
     has a row for every cell that a plane through the box cuts, since density lies on surfaces; or for every second
     one, for fewer than `FEW_FRAMES`.
 
@@ -212,7 +208,7 @@ def grid_for_resolution(
     """
     if not (box_side_m > 0.0 and pixel_footprint_m > 0.0):
         raise ValueError(f"a box of {box_side_m} m and a footprint of {pixel_footprint_m} m are not both above 0")
-    finest = max(2 * COARSEST_GRID, math.ceil(cells_per_pixel * box_side_m / pixel_footprint_m))
+    finest = max(2 * COARSEST_GRID, math.ceil(CELLS_PER_PIXEL * box_side_m / pixel_footprint_m))
     levels = 1 + math.ceil(math.log(finest / COARSEST_GRID) / math.log(LEVEL_GROWTH))
     rows = finest**2 / (2.0 if frames < FEW_FRAMES else 1.0)
     smallest, largest = LOG2_TABLE_RANGE

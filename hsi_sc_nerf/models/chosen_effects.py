@@ -12,7 +12,7 @@ from hsi_sc_nerf.files import content_of
 from hsi_sc_nerf.models.checkpoints import find_checkpoint, read_checkpoint
 from hsi_sc_nerf.packed.dataset import PackedDataset
 
-MODEL_EFFECTS = ("view_dependence", "still_chamber", "pose_refinement", "scattered_brightness")
+MODEL_EFFECTS = ("view_dependence", "still_chamber", "pose_refinement")
 """Effects that change what is built; all others are matters of `process` and `material`."""
 
 
@@ -35,13 +35,13 @@ def chosen_effects(setting: str, dataset: PackedDataset) -> tuple[str, ...]:
 
     Args:
         setting: auto, none, or names joined by commas.
-        dataset: its evidence decides "auto"; a dataset of an older version, without any, has the first three, but
-            poses from markers are not refined.
+        dataset: its evidence decides "auto"; a dataset of an older version, without any, has all effects, but poses
+            from markers are not refined.
     """
     if setting != "auto":
         return tuple(name for name in MODEL_EFFECTS if name in _named(setting))
     if not dataset.effects:
-        return MODEL_EFFECTS[: 2 if dataset.pose_method == "markers" else 3]
+        return MODEL_EFFECTS[:2] if dataset.pose_method == "markers" else MODEL_EFFECTS
     present = {effect.name for effect in dataset.effects if effect.present}
     return tuple(name for name in MODEL_EFFECTS if name in present)
 

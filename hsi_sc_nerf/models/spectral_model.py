@@ -63,8 +63,8 @@ class SpectralModelConfig(NerfactoModelConfig):
     effects: str = "auto"
     """Effects that the model simulates, joined by commas. view_dependence: a point's spectrum depends on its turn to
     the camera and the lamps, which stand still. still_chamber: the background is a picture of the chamber, taken from
-    the frames, instead of its median spectrum. pose_refinement: training moves the poses. scattered_brightness: one
-    cell of the grid a pixel averages over frames. none: no effect. auto: the effects that the dataset shows."""
+    the frames, instead of its median spectrum. pose_refinement: training moves the poses. none: no effect. auto: the
+    effects that the dataset shows (docs/validation/effects.md)."""
     background: Literal["chamber", "last-sample"] = "chamber"
     """Spectrum of the light that the object lets through. chamber: the chamber's. last-sample: that of the last
     sample of the ray, as in nerfacto."""
@@ -178,7 +178,7 @@ class SpectralModel(NerfactoModel):
         self.field = build_field(
             config,
             len(dataset.wavelengths_nm),
-            grid_for_dataset(dataset, "scattered_brightness" in self.effects) if config.match_resolution else None,
+            grid_for_dataset(dataset) if config.match_resolution else None,
             self.scene_box.aabb,
             self.num_train_data,
             view_dependent="view_dependence" in self.effects,

@@ -22,7 +22,6 @@ from hsi_sc_nerf.packed.dataset import PackedDataset
 from hsi_sc_nerf.plotting import COLOURS, STYLE, logarithmic_axis, new_figure, save_figure
 from hsi_sc_nerf.poses.model_selection import EVIDENCE_NEEDED
 from hsi_sc_nerf.poses.result import TurntablePoses
-from hsi_sc_nerf.processing.brightness_scatter import BrightnessScatter, brightness_scatter
 from hsi_sc_nerf.processing.chamber import background_pixels, gain_of_background_image
 from hsi_sc_nerf.processing.spectral_subspace import training_subspace
 from hsi_sc_nerf.processing.view_changes import (
@@ -40,9 +39,6 @@ LEAST_VIEW_CHANGE_PERCENT = 0.35
 bumpy object (docs/validation/effects.md)."""
 LEAST_PICTURE = 0.005
 """Least gain of an image of the chamber, reflectance; the noise of a pixel is larger."""
-LEAST_SCATTER_PERCENT, SCATTER_OF_TEXTURE = 1.5, 0.5
-"""Least scatter of brightness from frame to frame, and as a fraction of the texture: where a coarser grid begins to
-gain (docs/validation/effects.md)."""
 LEAST_HEIGHT_CHANGE_PERCENT = 2.0
 """Least change with height and slope: more than a colour that varies with the height causes in even light."""
 LEAST_POSE_ERROR_PX = 0.1
@@ -85,7 +81,6 @@ def measure_effects(
         view_dependence(None if seen is None else change_with_direction(seen)),
         still_chamber(gain_of_background_image(*background_pixels(dataset, bins, masks))),
         pose_refinement(poses, dataset.object_box_m),
-        scattered_brightness(None if seen is None else brightness_scatter(seen, dataset.camera_to_worlds)),
         lamp_drift(*drift),
         lens_distortion(poses),
         wobble(poses),
@@ -136,24 +131,6 @@ def pose_refinement(poses: TurntablePoses, object_box_m: Float[np.ndarray, "2 3"
         *("pose_refinement", float(error_px), 0.0, LEAST_POSE_ERROR_PX, "px"),
         "The poses are less certain than those that training finds, so training refines them.",
         "The poses are more certain than those that training finds, so they are kept.",
-    )
-
-
-def scattered_brightness(found: BrightnessScatter | None) -> EffectEvidence:
-    """Whether brightness scatters so much from frame to frame that the field has to average over frames."""
-    if found is None:
-        sentence = (
-            "Too little of the object is visible, or its frames are too far apart, to tell scatter from texture, so "
-            "the model's grid has two cells a pixel."
-        )
-        return EffectEvidence("scattered_brightness", False, None, None, None, "%", sentence)
-    least = max(LEAST_SCATTER_PERCENT, 100.0 * SCATTER_OF_TEXTURE * found.texture)
-    return _decided(
-        *("scattered_brightness", 100.0 * found.scatter.rms, 100.0 * found.scatter.noise, least, "%"),
-        "The brightness of points scatters from frame to frame by more than half of their texture, as by glints, so "
-        "the model's grid has one cell a pixel, which averages it.",
-        "The brightness of points hardly scatters from frame to frame beside their texture, so the model's grid has "
-        "two cells a pixel.",
     )
 
 

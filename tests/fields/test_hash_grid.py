@@ -100,7 +100,6 @@ def test_the_viewer_may_interpolate_while_training_does():
 def test_half_a_pixel_is_a_cell():
     assert grid_for_resolution(0.2, 0.002, 60).finest == 200
     assert grid_for_resolution(0.2, 0.0005, 60).finest == 800
-    assert grid_for_resolution(0.2, 0.0005, 60, cells_per_pixel=1.0) == grid_for_resolution(0.2, 0.001, 60)
 
 
 @pytest.mark.parametrize("footprint_m", [0.003, 0.002, 0.001, 0.0004])

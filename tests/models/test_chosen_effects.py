@@ -11,7 +11,6 @@ from small_trainer import trainer
 
 from hsi_sc_nerf.config import hsi_sc_nerf_paper
 from hsi_sc_nerf.errors import InputError
-from hsi_sc_nerf.fields.hash_grid import FusedHashEncoding
 from hsi_sc_nerf.findings import EffectEvidence
 from hsi_sc_nerf.models.chosen_effects import MODEL_EFFECTS, chosen_effects, effects_setting, require_effects
 from hsi_sc_nerf.models.spectral_model import SpectralModelConfig
@@ -58,7 +57,7 @@ def test_the_evidence_or_the_user_decides(dataset):
 def test_an_older_dataset_has_all_effects(dataset):
     old = replace(dataset, effects=())
     assert chosen_effects("auto", old) == ("view_dependence", "still_chamber")
-    assert chosen_effects("auto", replace(old, pose_method="colmap")) == MODEL_EFFECTS[:3]
+    assert chosen_effects("auto", replace(old, pose_method="colmap")) == MODEL_EFFECTS
 
 
 @pytest.mark.parametrize("setting", ["gloss", "view_dependence,wobble", "", "auto,none"])
@@ -87,16 +86,6 @@ def test_what_is_off_is_not_built(tiny_dataset, tmp_path):
     assert [*bare.camera_optimizer.parameters()] == []
     assert len([*full.camera_optimizer.parameters()]) == 2
     assert "camera_opt" not in bare.get_param_groups()
-
-
-def test_scattered_brightness_halves_the_cells_of_the_grid(tiny_dataset, tmp_path, monkeypatch):
-    monkeypatch.setattr("small_trainer.shrink", lambda model: None)
-    finest = {}
-    for effects in ("none", "scattered_brightness"):
-        _, model = made(tiny_dataset, tmp_path / effects, effects)
-        (grid,) = (one for one in model.field.mlp_base.modules() if isinstance(one, FusedHashEncoding))
-        finest[effects] = float(grid.scalings.max())
-    assert finest["scattered_brightness"] == pytest.approx(finest["none"] / 2.0, abs=1.0)
 
 
 @pytest.mark.slow

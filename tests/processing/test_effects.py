@@ -28,8 +28,8 @@ from hsi_sc_nerf.processing.effects import (
 from hsi_sc_nerf.processing.view_changes import Change
 
 BOX_M = np.array([[-0.04, -0.03, 0.07], [0.04, 0.03, 0.15]])
-NAMES = "view_dependence still_chamber pose_refinement scattered_brightness lamp_drift lens_distortion wobble "
-NAMES += "saturated_highlights spectral_rank uneven_light"
+NAMES = "view_dependence still_chamber pose_refinement lamp_drift lens_distortion wobble saturated_highlights "
+NAMES += "spectral_rank uneven_light"
 
 
 def poses(**changes):

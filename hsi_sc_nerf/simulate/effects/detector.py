@@ -238,26 +238,6 @@ class BadPixels(ReadoutEffect):
 
 
 @dataclass(frozen=True)
-class Speckle(ReadoutEffect):
-    """Pixels are brighter or darker by chance, in all bands alike: glints of a rough skin that a pixel just catches.
-
-    It is in frames and white cubes, and differs in each.
-    """
-
-    name: ClassVar[str] = "speckle"
-    spread: float = between(0.0, 0.3, default=0.05)
-    """Standard deviation, as a fraction of the signal."""
-
-    def read_out(self, counts: Counts, sensor: SensorSettings, maps: Maps, rng: np.random.Generator) -> Counts:
-        """Multiply the signal above the dark level."""
-        factor = 1.0 + np.float32(self.spread) * rng.standard_normal((*counts.shape[:2], 1), dtype=np.float32)
-        counts -= np.float32(sensor.dark_level)
-        counts *= np.maximum(factor, 0.0)
-        counts += np.float32(sensor.dark_level)
-        return counts
-
-
-@dataclass(frozen=True)
 class PhotonNoise(ReadoutEffect):
     """Shot noise: the number of electrons is Poisson distributed, so its variance equals its mean."""
 
@@ -319,7 +299,6 @@ EFFECTS: tuple[type[Effect], ...] = (
     SpectralSmile,
     Saturation,
     TarpExposure,
-    Speckle,
     PhotonNoise,
     DarkPattern,
     ReadNoise,

@@ -259,7 +259,6 @@ STRENGTHS = {
     "image_rotation": {"quarter_turns": 1},
     "spectral_smile": {"shift_nm": 5.0},
     "saturation": {"exposure_factor": 1.4},
-    "speckle": {"spread": 0.08},
     "photon_noise": {},
     "dark_pattern": {"spread": 9.0},
     "read_noise": {"electrons": 50.0},
@@ -295,9 +294,6 @@ def by_definition(changed, renderer, exposure):
     def rng(name, *exposure):
         return effect_rng(changed.seed, on[name], *exposure)
 
-    if "speckle" in on:
-        speckle = rng("speckle", exposure, 0).standard_normal(counts.shape[:2], dtype=np.float32)
-        counts = DARK + (counts - DARK) * (1.0 + 0.08 * speckle[..., None])
     if "photon_noise" in on:
         electrons = ((counts - DARK) * ELECTRONS_PER_COUNT).astype(np.float32)
         random = rng("photon_noise", exposure, 0)
